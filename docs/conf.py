@@ -5,12 +5,16 @@ import re
 import shutil
 import subprocess
 import sys
+import urllib.request
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from docutils import nodes  # noqa: E402
+from furo.navigation import get_navigation_tree  # noqa: E402
 from sphinx.addnodes import pending_xref  # noqa: E402
 from sphinx.application import Sphinx  # noqa: E402
 from sphinx.transforms import SphinxTransform  # noqa: E402
@@ -22,7 +26,21 @@ from dvae.cli.app import COMMANDS  # noqa: E402
 project, author = "dvae", "The dvae authors"
 project_copyright = "The dvae authors, Apache License 2.0"
 release = version = dvae.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions = ["myst_nb"]
+extensions += [f"sphinx.ext.{name}" for name in ("autodoc", "autosummary", "intersphinx", "napoleon")]
+
+# Types of other libraries link to their pages if these can be reached; the site builds without a network, too.
+intersphinx_mapping = {}
+for name, address in {
+    "python": "https://docs.python.org/3",
+    "torch": "https://docs.pytorch.org/docs/stable",
+    "pyro": "https://docs.pyro.ai/en/stable",
+    "numpy": "https://numpy.org/doc/stable",
+    "pandas": "https://pandas.pydata.org/docs",
+    "matplotlib": "https://matplotlib.org/stable",
+}.items():
+    with suppress(OSError), urllib.request.urlopen(f"{address}/objects.inv", timeout=5):
+        intersphinx_mapping[name] = (address, None)
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"dvae {release}"
@@ -44,7 +62,9 @@ for name in ("CONTRIBUTING", "CHANGELOG"):
 
 # The page of the command line is the help of its commands.
 help_of = {"COLUMNS": "110", "NO_COLOR": "1", "PYTHONPATH": str(ROOT)}
-parts = ["# Command line\n\nLook up the arguments of a command; `--help-all` lists all options of `fit` and `sweep`.\n"]
+parts = [
+    "# Command line\n\nLook up the arguments of each command. `--help-all` lists all options of `fit` and `sweep`.\n"
+]
 for name in COMMANDS:
     program = [sys.executable, "-c", "import dvae.cli as c; c.main()", *name.split(), "--help"]
     printed = subprocess.run(program, env=os.environ | help_of, capture_output=True, text=True, check=True).stdout
@@ -80,7 +100,7 @@ napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 suppress_warnings = ["ref.python"]  # names of two classes
 
-# Docstrings are plain text with `code`, *emphasis*, examples and indented blocks, converted here to reStructuredText.
+# Docstrings are plain text with `code`, *emphasis*, examples and indented blocks; this makes reStructuredText of them.
 _MARKS = re.compile(
     r"`([^`]+)`(?=(\w)?)|(^ *\* |(?<![\w*])\*(?! )[^*]+(?<! )\*(?!\w))|([*|\\])|(_)(?!\w)", re.MULTILINE
 )
@@ -104,6 +124,18 @@ def _as_text(_app: object, _what: str, _name: str, _object: object, _options: ob
     lines[:] = "".join(parts).split("\n")
 
 
+def _skip_tests(_app: object, _what: str, name: str, *_: object) -> bool | None:
+    """Leave the tests of `dvae.testing` out of the reference and of the search."""
+    return True if name.startswith("test_") else None
+
+
+def _shorten_sidebar(_app: object, _page: str, _template: str, context: dict[str, Any], _tree: object) -> None:
+    """List pages in the sidebar, and not the objects of the reference."""
+    if "toctree" in context:
+        html = context["toctree"](collapse=True, titles_only=True, maxdepth=1, includehidden=True)
+        context["furo_navigation_tree"] = get_navigation_tree(html)
+
+
 def _adapt_links(_app: object, page: str, source: list[str]) -> None:
     """Adapt the links of notebooks to their copies."""
     if page.startswith("notebooks/"):
@@ -116,7 +148,7 @@ class LinkNames(SphinxTransform):
     default_priority = 5
 
     def apply(self, **_: object) -> None:
-        """Replace the names by links."""
+        """Replace each such name by a link."""
         for literal in list(self.document.findall(nodes.literal)):
             name, linked = literal.astext().partition("(")[0], nodes.reference | nodes.title | pending_xref
             if not re.fullmatch(r"dvae(\.\w+)+", name) or isinstance(literal.parent, linked):
@@ -129,5 +161,7 @@ class LinkNames(SphinxTransform):
 def setup(app: Sphinx) -> None:
     """Connect the conversions; docstrings before napoleon, which parses their sections."""
     app.connect("autodoc-process-docstring", _as_text, priority=400)
+    app.connect("autodoc-skip-member", _skip_tests)
     app.connect("source-read", _adapt_links)
+    app.connect("html-page-context", _shorten_sidebar, priority=900)  # after the theme
     app.add_transform(LinkNames)

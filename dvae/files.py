@@ -1,7 +1,7 @@
 """Safe file access: open only plain files of bounded size, and replace files atomically.
 
-A folder copied from elsewhere may contain links to the user's files, FIFOs and devices that never return or never end,
-and files larger than memory. All files in a run directory are therefore opened through this module. The path of the
+A folder copied from elsewhere may contain links to the user's files, FIFOs and devices that block or never end, and
+files larger than memory. All files in a run directory are therefore opened through this module. The path of the
 folder itself is given by the user and may be a link.
 """
 
@@ -37,8 +37,11 @@ def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bo
 
     Args:
         path: path of the file.
-        flags: flags of `os.open`.
+        flags: flags of `os.open`, such as `os.O_RDONLY`.
         links: whether to follow a link, for a path given by the user.
+
+    Returns:
+        The open file, which the caller must close.
 
     Raises:
         FileRefused: the path is a link, a directory, a FIFO, a socket or a device.
@@ -51,16 +54,23 @@ def open_plain(path: str | os.PathLike[str], flags: int = os.O_RDONLY, links: bo
         number = os.open(path, flags | (_PLAIN & ~getattr(os, "O_NOFOLLOW", 0) if links else _PLAIN), 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV):
-            raise FileRefused(f"{path} is no file but a link, a directory, a FIFO, a socket or a device") from error
+            raise FileRefused(
+                f"{path} must be a plain file, not a link, a directory, a FIFO, a socket or a device"
+            ) from error
         raise
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
-        raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device")
+        raise FileRefused(f"{path} must be a plain file, not a directory, a FIFO, a socket or a device")
     return os.fdopen(number, "r+b" if flags & os.O_RDWR else "wb" if flags & os.O_WRONLY else "rb", buffering=0)
 
 
 def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
     """Return the content of a plain file of at most `most` bytes.
+
+    Args:
+        path: path of the file.
+        most: maximum size in bytes.
+        links: whether to follow a link, for a path given by the user.
 
     Raises:
         FileRefused: the path is not a plain file, or the file is larger.
@@ -69,7 +79,7 @@ def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
     with open_plain(path, links=links) as file, with_path(path):
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise FileRefused(f"{path} has {size} bytes, and can rightly have {most} at most")
+            raise FileRefused(f"{path} has {size} bytes, but at most {most} are allowed")
         parts, remaining = [], most + 1
         while remaining and (
             part := file.read(min(remaining, 1 << 24))
@@ -77,7 +87,7 @@ def read(path: str | os.PathLike[str], most: int, links: bool = False) -> bytes:
             parts.append(part)
             remaining -= len(part)
     if not remaining:
-        raise FileRefused(f"{path} grew beyond {most} bytes while it was read")
+        raise FileRefused(f"{path} grew beyond {most} bytes while it was read; wait until it is complete")
     return b"".join(parts)
 
 
@@ -99,7 +109,7 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def write_all(file: BinaryIO, content: bytes) -> None:
-    """Write all content to an unbuffered file, which may accept it in several parts."""
+    """Write all content to an unbuffered file, whose `write` may write only a part at a time."""
     remaining = memoryview(content)
     while remaining:
         remaining = remaining[file.write(remaining) :]
@@ -115,7 +125,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """
     path = Path(path)
     if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
-        raise FileRefused(f"{path} is no file but a directory, a FIFO, a socket or a device; choose another name")
+        raise FileRefused(
+            f"{path} is a directory, a FIFO, a socket or a device, which is not replaced; choose another name"
+        )
     with create_folder(path.parent):
         _remove_leftovers(path.parent)
         new = path.with_name(f"{temporary()}{uuid4().hex}")
@@ -179,7 +191,8 @@ def with_path(path: str | os.PathLike[str], temporary: Path | None = None) -> It
 
     Args:
         path: a file, or a folder of files.
-        temporary: temporary name of `path` until it is complete.
+        temporary: path that is written first and then renamed to `path`. Errors about this path, or about files in it,
+            are raised with the final path instead.
     """
     try:
         yield

@@ -15,8 +15,11 @@ def importing(package: str, places: Mapping[str, str] | None = None) -> Callable
     """Return a `__getattr__` for a package that imports its modules and public names at first use.
 
     Args:
-        package: name of the package.
-        places: {public name: module of the package that defines it}.
+        package: full name of the package, its `__name__`.
+        places: {public name: module that defines it, relative to the package}.
+
+    Returns:
+        Function from a name to the imported module or object; it raises an AttributeError for an unknown name.
     """
 
     def find(name: str) -> Any:
@@ -35,6 +38,10 @@ def importing(package: str, places: Mapping[str, str] | None = None) -> Callable
 
 def optional(module: str, extra: str) -> Any:
     """Import a module of an optional package.
+
+    Args:
+        module: full name of the module.
+        extra: extra of pyro-dvae that installs the package, such as "motion".
 
     Raises:
         ImportError: the package is not installed; the message contains the install command.

@@ -2,9 +2,9 @@
 
 Two programs running at the same time would share one handler stack and one stream of random numbers. Building a model
 and running a program therefore hold the lock `serialized`: in `DynamicalVAE.running`, in the terms of a bound, and in a
-step of `SVI`. `seeded` holds it too, and also sets and restores the random state. Threads wait for one such step, not
-for a whole fit. Processes are independent (`dvae.runs.sweep`). If a process forks while another thread holds the lock,
-the child starts with a free lock and an empty handler stack.
+step of `SVI`. `seeded` holds it for a whole block, with another random state. Threads wait for one such step, not for a
+whole fit. Processes are independent (`dvae.runs.sweep`). If a process forks while another thread holds the lock, the
+child starts with a free lock and an empty handler stack.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
 
 
 class _ProgramLock(ContextDecorator):
-    """A reentrant lock, usable as a context manager or a decorator."""
+    """A reentrant lock, usable as a context manager or a decorator.
+
+    It removes Pyro's table of shapes from the messages of errors that are raised while it is held.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.RLock()

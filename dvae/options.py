@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 LONGEST = 10_000
 """Maximum number of characters of a string, and of entries of a tuple of strings or of a mapping."""
 DEEPEST = 64
-"""Maximum number of layers: entries of a tuple of numbers."""
+"""Maximum number of layers, and thus of entries of a tuple that does not contain strings."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,9 @@ class Range:
     """A range of allowed numbers.
 
     Args:
-        least, most: ends of the range.
-        above, below: whether to exclude the lower or upper end. Infinite ends are always excluded.
+        least, most: lower and upper end of the range.
+        above: whether to exclude the lower end.
+        below: whether to exclude the upper end. Infinite ends are always excluded.
     """
 
     least: float = -inf
@@ -76,6 +77,9 @@ Positive = Annotated[float, Range(0, above=True)]
 def check(options: Any) -> None:
     """Check that every field of a dataclass has its declared type and range.
 
+    Args:
+        options: instance of the dataclass.
+
     Raises:
         TypeError: a value has another type.
         ValueError: a value is out of range or not an allowed name; the message suggests the nearest name.
@@ -89,6 +93,10 @@ def check(options: Any) -> None:
 def require(hint: Any, **values: Any) -> None:
     """Check that arguments have a given type and range.
 
+    Args:
+        hint: allowed type, such as `Size` or `Literal["a", "b"]`.
+        values: arguments by name; errors contain the name.
+
     Raises:
         TypeError, ValueError: as in `check`.
     """
@@ -98,7 +106,13 @@ def require(hint: Any, **values: Any) -> None:
 
 
 def problem(name: str, value: Any, hint: Any) -> Exception | None:
-    """Return the error for a value that does not match its type, or None if it does."""
+    """Return the error for a value that does not match its type, or None if it does.
+
+    Args:
+        name: name of the option, for the message.
+        value: value of the option.
+        hint: allowed type, as in `require`.
+    """
     origin, arguments = get_origin(hint), get_args(hint)
     message = f"{name} is {reprlib.repr(value)}"
     if origin is Annotated:
@@ -157,7 +171,7 @@ def tuples(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every option of a nested configuration with its dotted name."""
+    """Yield (dotted name, value) of every option of a nested configuration, such as ("training.steps", 100)."""
     for name, value in options.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{name}.")
@@ -199,7 +213,7 @@ def _problem_of_entries(name: str, value: Any, hints: tuple[Any, ...]) -> Except
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    """Return the types of the fields; {} if a type name cannot be resolved outside its own file."""
+    """Return {name of a field: its type}; {} if a type name of the dataclass cannot be resolved here."""
     try:
         hints = get_type_hints(kind, include_extras=True)
     except NameError:

@@ -53,11 +53,11 @@ class Method(Trainable):
         return generative, guide(generative, self.inference)
 
     def sizes(self) -> dict[str, int]:
-        """Return the sizes of the latents."""
+        """Return the sizes of the latents by name, such as {"z": 16}."""
         return {"z": self.latent or 0}
 
     def networks(self) -> Mapping[str, NetworkSpec]:
-        """Return the networks by factor."""
+        """Return the network specifications by factor, such as {"default": Recurrent(64)}."""
         raise NotImplementedError(
             f"{type(self).__name__} defines no networks; define `networks(self)`, which returns them by factor, such "
             'as {"default": Recurrent(64)}, or override `build`'
@@ -85,8 +85,8 @@ class LikelihoodMethod(Method):
             "normal" (scale read from the parents) or "student" (Student t). By default the distributions of a table's
             columns, or "fixed".
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
-            an offset: one-step forecasts are sharp, but free runs can drift without limit. A smaller share limits the
-            drift.
+            an offset: one-step forecasts are sharp, but long forecasts can drift without limit. A smaller share limits
+            the drift.
         scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
             ignore it. None: 1 for data with a horizon and 0 for others.
@@ -264,13 +264,13 @@ def rising(level: float, steps: int) -> Ramp:
 
 
 def fit_units(model: DynamicalVAE, train: Any) -> None:
-    """Fit the units of x to 1024 windows of the training data, as the model sees them."""
+    """Fit the units of x in a model to 1024 windows of the training data, in the model's view."""
     data = model.read(train.sample(1024, torch.default_generator), precise=True)
     model.units[WHOLE].fit(interpolate_missing(data[WHOLE], data.mask()))
 
 
 def start_priors(model: DynamicalVAE, train: Any) -> None:
-    """Initialise the pseudo-sequences of Vamp priors with windows of the training data, as the model sees them."""
+    """Initialise the pseudo-sequences of a model's Vamp priors with windows of the training data, in its view."""
     for distribution in model.modules():
         if isinstance(distribution, VampModule):
             distribution.start_at(model.read(train.sample(distribution.components, torch.default_generator)))

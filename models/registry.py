@@ -73,7 +73,9 @@ class Registry(UserDict[str, Any]):
         super().__init__({name: EntryPoint(name, value, group) for name, value in builtin.items()})
         for entry in entry_points(group=group):
             if entry.name in builtin:
-                raise ValueError(f"the name of entry point {entry.value} is already taken in {group}: {entry.name}")
+                raise ValueError(
+                    f"the entry point {entry.value} has the name {entry.name!r}, which {group} already has; rename it"
+                )
             self[entry.name] = entry
 
     @override
@@ -88,7 +90,7 @@ class Registry(UserDict[str, Any]):
             attributes: attributes of the class or of its bases, such as "source".
 
         Returns:
-            Their texts; None for an option of the method, which is a field of the dataclass.
+            Values of the attributes; None for each attribute that is an option, a field of the dataclass.
         """
         literals = _literals(*self.data[name].value.split(":"))
         if not literals.keys() >= {*attributes}:
@@ -102,7 +104,15 @@ class Registry(UserDict[str, Any]):
 
 @cache
 def _literals(module: str, name: str) -> dict[str, str | None]:
-    """Return the texts that the body of a class and of its bases assign to attributes; None for a dataclass field."""
+    """Return the texts that a class and its bases assign to attributes, read from the source file.
+
+    Args:
+        module: name of the module, which is not imported.
+        name: name of the class.
+
+    Returns:
+        Text of each attribute, or None for a field of the dataclass; empty if the source file does not exist.
+    """
     package, *parts = module.split(".")
     spec = find_spec(package)  # finding the module itself would import its packages
     file = Path(spec.origin or "").parent.joinpath(*parts).with_suffix(".py") if spec is not None else Path()

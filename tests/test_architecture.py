@@ -252,16 +252,3 @@ def test_no_file_contains_machine_paths():
     others = [ROOT / name for name in ("Makefile", "README.md", "pyproject.toml", "constraints.txt", ".ci/run")]
     for path in [*sources().values(), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").rglob("*.py"), *others]:
         assert not absolute.search(path.read_text(encoding="utf-8")), path
-
-
-@pytest.mark.slow
-def test_readme_example_beats_zero_velocity():
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert "steps=600" in example
-    variables = {}
-    exec(compile(example.replace("steps=600", "steps=120"), "README.md", "exec"), variables)  # a fifth suffices
-    scores = variables["scores"]
-    for error in ("ADE", "FDE", "MMADE", "MMFDE"):
-        assert scores["model"][error].mean < 0.9 * scores["zero velocity"][error].mean
-        behind = scores.difference("model", "zero velocity", error)
-        assert behind.mean < -5 * behind.standard_error

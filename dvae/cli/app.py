@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def exit_code(run: Callable[[], int]) -> int:
-    """Run the program and return its exit code, which a further Ctrl-C no longer changes."""
+    """Run the program and return its exit code; a Ctrl-C after the end of the command is ignored."""
     try:
         code = run()
     except KeyboardInterrupt:  # a second one, while the message of the first one is printed
@@ -115,7 +115,7 @@ def exit_code(run: Callable[[], int]) -> int:
 
 
 def _is_unread(line: str = "") -> bool:
-    """Return whether the reader of the standard output has closed it, after writing a line to it."""
+    """Write a line to the standard output, and return whether its reader has closed it."""
     try:
         sys.stdout.write(line)
         sys.stdout.flush()

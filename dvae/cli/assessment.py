@@ -53,8 +53,8 @@ class Control:
         for run in loaded:
             if not isinstance(run.model, TrajectoryModel):
                 raise UsageError(
-                    f"--joints, --exchange and --temperature are for methods that take trajectories; {run.path} holds "
-                    f"{run.method.name}"
+                    f"--joints, --exchange and --temperature are for methods that take trajectories; {run.path} is a "
+                    f"run of {run.method.name}"
                 )
         conditioned = windows.given(joint_names(self.joints or ()))
         return conditioned if self.exchange is None else motion.ExchangedWindows(conditioned, self.exchange)
@@ -96,7 +96,7 @@ def evaluate(
         samples: number K of forecasts of each window.
         bound_particles: number of particles of the IWAE bound; 0 omits it.
         log_score_particles: number of particles of the log density of the future under the forecasts; 0 omits it.
-        pose_prior: run of a pose-prior, which scores the poses of the forecasts.
+        pose_prior: run of the method pose-prior, which scores the poses of the forecasts.
         classifier: runs of action-classifiers with different labels, which score the actions in the forecasts.
         seed: seed of the draws.
         batch_size: number of windows forecast at once.
@@ -180,7 +180,9 @@ def _segments(paths: Sequence[Path], data: str | None, scoring: ForecastScoring,
     ]:
         option = inapplicable[0]
         options = "--joints, --exchange and --temperature are" if option == "control" else f"--{option} is"
-        raise UsageError(f"{options.replace('_', '-')} for forecasts, and {paths[0]} generates whole segments")
+        raise UsageError(
+            f"{options.replace('_', '-')} for forecasts, but {paths[0]} generates whole segments; leave them out"
+        )
     loaded = loading.with_equal_windows(paths, data, ("segments",), scoring.failed)
     data_set = loading.data_of(data, *loaded)
     by_name = dict(zip(loading.names(loaded), loaded, strict=True))
@@ -231,7 +233,7 @@ def compare(
 ) -> None:
     """Compare runs on the test windows of their protocol.
 
-    Runs that differ only in the seed are seeds of one row. All runs must have finished. For whole sequences of a
+    Runs that differ only in the seed share one row of the table. All runs must have finished. For whole sequences of a
     table, only bounds are compared.
 
     Args:
@@ -243,8 +245,9 @@ def compare(
         contrasts: number of windows for the mutual information of latents and data; 0 omits it.
         samples: number of forecasts of each window.
         forecasts: also score forecasts, which takes longest.
-        draw_emission: forecast draws of x, or its means. By default draws for a table and means for motion, whose
-            published scores use means, unless the data are discrete or nothing is latent.
+        draw_emission: whether forecasts are draws of x or means of its emission distribution. By default draws for a
+            table and means for motion, whose published scores use means, unless the data are discrete or nothing is
+            latent.
         stride: frames between the starts of test windows, in place of the protocol's; a larger stride is faster.
         seed: seed of the draws.
         batch_size: number of windows scored at once.
@@ -306,7 +309,9 @@ def _classifiers(scoring: ForecastScoring, data: str | None, scored_run: runs.Lo
         if loaded.method.name != "action-classifier":
             raise UsageError(f"--classifier {path} is a fitted {loaded.method.name}, not an action-classifier")
         if loaded.model.label in classifiers:
-            raise UsageError(f"--classifier {path} is the second for the label {loaded.model.label!r}; give only one")
+            raise UsageError(
+                f"--classifier {path} is a second classifier of the label {loaded.model.label!r}; give one per label"
+            )
         if not loaded.alike(scored_run):
             source, other = (f"{run.config.data.path}, {run.schema.protocol.name}" for run in (loaded, scored_run))
             raise UsageError(

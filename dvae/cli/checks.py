@@ -73,7 +73,7 @@ def calibration(
         draws: number of draws from the guide for each simulation.
         ranked_steps: number of time steps, evenly spaced, at which local latents are ranked.
         samples: number of replicates of each test window, at least 19.
-        draw_emission: replicate draws of x, or its means, which have no emission noise. Methods that follow given
+        draw_emission: whether replicates are draws of x, or means without emission noise. Methods that follow given
             paths (trajevae, cvae-rnn, motion-infilling) always return means.
         seed: seed of the draws.
         batch_size: number of windows replicated at once.
@@ -125,9 +125,9 @@ def posterior(
 ) -> None:
     """Compare a run's guide with the posterior of the latents of some test windows.
 
-    Computes the kernel Stein discrepancy of the guide in moments, and then means, deviations and correlations of the
-    guide and of NUTS, which takes minutes for each window: begin with few --frames. Prints both tables, and writes each
-    to posterior.json in the run, or to --out, as soon as it is computed.
+    First computes the kernel Stein discrepancy of the guide, which is quick. Then computes means, deviations and
+    correlations of the guide and of NUTS, which takes minutes for each window: begin with few --frames. Prints both
+    tables, and writes each to posterior.json in the run, or to --out, as soon as it is computed.
 
     Args:
         run: the run directory.
@@ -194,13 +194,14 @@ def gap(
         run: the run directory.
         data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         count: number of test windows, drawn at random; the time is proportional to it.
-        particles: number of particles of IWAE and FIVO, and of draws over which ELBOs are averaged.
+        particles: number of particles of the IWAE and FIVO bounds, and number of draws that ELBOs average.
         temperatures: number of temperatures of annealed importance sampling; more give closer bounds.
-        chains: number of chains for each window.
-        fitting: number of optimiser steps of the guide of each window; 0 omits the parts of the gap.
-        reach: steps between latents that these guides read linearly; by default all that the equations allow.
+        chains: number of chains of annealed importance sampling for each window.
+        fitting: number of optimiser steps that fit a separate guide to each window; 0 omits the parts of the gap.
+        reach: largest distance in steps of linear dependencies between local latents in these guides; no limit by
+            default.
         seed: seed of the draws.
-        batch_size: number of windows at once.
+        batch_size: number of windows processed at once.
         out: file to write instead of gap.json in the run.
         figure: save all bounds on one axis.
     """
@@ -249,7 +250,7 @@ def coverage(
         data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         level: share of futures that bands contain.
         label: label of test clips that divides them into those for calibration and those for the test.
-        values: values of the label of the clips for calibration.
+        values: label values whose clips are used for calibration; the other clips are used for the test.
         samples: number of forecasts of each window.
         seed: seed of the draws.
         batch_size: number of windows forecast at once.
@@ -289,7 +290,9 @@ def _calibration_and_test(loaded: runs.Loaded, data_set: Any, label: str | None,
     test = motion.MotionSet(clips, motion_set.skeleton, data_set.path, missing=motion_set.missing)
     others = tuple(sorted(label_values - {*values}))
     if not others:
-        raise UsageError(f"--values {' '.join(values)} selects all test clips; leave some {label} to test on")
+        raise UsageError(
+            f"--values {' '.join(values)} selects all test clips; leave out at least one {label} for the test"
+        )
     return [
         motion.windows(test, replace(data_set.protocol, split_by=label, train=(), test=part), "test")
         for part in (tuple(values), others)
@@ -328,7 +331,7 @@ def edges(
         source: data to fit to.
         generative: equation of the model, such as "p(z_t | z_{t-1}) p(x_t | z_t)".
         inference: equation of the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; by default "faithful", a guide with all
-            dependencies of the posterior, derived again for every reduced model; "" for a model without latents.
+            dependencies of the posterior, derived anew for every reduced model; "" for a model without latents.
         latent: size of the latents.
         out: directory of the run directories, such as whole-seed0 and model-without-z_t-1-to-z_t-seed0.
         seeds: seeds of initial weights, batches and draws, one run for each.
@@ -343,7 +346,9 @@ def edges(
     if (method is None) == (generative is None):
         raise UsageError("give the name of a method, or --generative, with --inference for your own guide")
     if method is not None and inference is not None:
-        raise UsageError(f"--inference is the guide of --generative; {method} has its own")
+        raise UsageError(
+            f"--inference is the guide for --generative, but {method} has its own guide; leave --inference out"
+        )
     training_values = [value for value in vars(training).values() if value not in (None, False)]
     if out is None and (training_values or source != DataOptions()):
         raise UsageError("fits need a directory for their runs: give --out DIR")

@@ -61,10 +61,10 @@ def arguments() -> Iterator[None]:
 
 
 def at_least(smallest: int, **options: int | None) -> None:
-    """Check that options are None or at least `smallest`.
+    """Check that each option is None or at least `smallest`.
 
     Raises:
-        UsageError: an option is smaller.
+        UsageError: an option is smaller than `smallest`.
     """
     for name, value in options.items():
         if value is not None and value < smallest:

@@ -49,16 +49,17 @@ def options_of(name: str, kind: type[Any], *aside: str, common: Collection[str] 
     Args:
         name: name of the new class.
         kind: dataclass with the options.
-        aside: names of options to omit.
+        aside: names of fields of `kind` to omit.
         common: names of the options that `--help` shows; all by default.
     """
-    hints = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind)  # without ranges, which `kind` checks with a clearer error
     options, schedules = [], {*get_args(Schedule)}
     for option in fields(kind):
         hint = hints[option.name]
         if schedules & {*get_args(hint)}:
             hint = reduce(or_, [part for part in get_args(hint) if part not in schedules])
-        optional: Any = Annotated[bool, tyro.conf.FlagCreatePairsOff] if hint is bool else hint | None
+        mark = tyro.conf.FlagCreatePairsOff if hint is bool else tyro.conf.DisallowNone
+        optional: Any = Annotated[bool if hint is bool else hint | None, mark]
         annotated = optional if common is None or option.name in common else Annotated[optional, EXPERT]
         options.append((option.name, annotated, False if hint is bool else None))
     kept = [option for option in options if option[0] not in aside]
@@ -150,7 +151,7 @@ class DataOptions(ColumnOptions):
         if kind == "windows":
             kind = "panel" if is_table(self.data) or table_options else "motion"
             if kind == "panel" and self.data == SIMULATED:
-                raise UsageError(f"--{table_options[0]} is for tables; name one with --data")
+                raise UsageError(f"--{table_options[0]} is for tables; give the path of a table with --data")
         for other, options in OF_KINDS.items():
             if other != kind and (inapplicable := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
                 raise UsageError(
@@ -222,7 +223,7 @@ def resume(
 ) -> None:
     """Continue a run from its last checkpoint.
 
-    In a longer run, the learning rate falls and scheduled sampling rises over the same shares of the run.
+    If `steps` extends the run, the schedules of learning rate and scheduled sampling stretch to the new length.
 
     Args:
         run: run directory.
@@ -262,7 +263,7 @@ def sweep(
         model: options of all methods, in place of their defaults.
         training: options of the runs; `dvae show METHOD` prints the defaults of each method.
         source: data to fit to.
-        grid: TOML file of named equations and methods, each with its options and their values; see docs/sweeps.md.
+        grid: TOML file of named equations and methods, each with its options and their values; see docs/how-to/sweeps_and_studies.md.
         seeds: seeds of initial weights, batches and draws, one run for each; by default the seeds of the grid, or 0, 1
             and 2.
         latent: sizes of z, one run for each.
@@ -270,7 +271,7 @@ def sweep(
         scheduler: address of a dask scheduler, such as tcp://host:8786, whose workers replace --jobs.
     """
     if bool(method) == bool(grid) or seeds == ():
-        raise UsageError("give at least one method and one seed, or no method and --grid")
+        raise UsageError("give either methods or --grid, and at least one seed")
     if grid is not None and latent:
         raise UsageError("--latent is for methods given by name; in a grid, write each.latent = [8, 16]")
     at_least(1, jobs=jobs)
@@ -347,7 +348,7 @@ def _report(result: Fit) -> None:
 
 
 def _use(name: str, run: Path) -> str:
-    """Describe the next commands for a fitted run."""
+    """Return the commands to use next with a fitted run."""
     if name in metric_models():
         target = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"

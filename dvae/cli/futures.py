@@ -239,7 +239,7 @@ def impute(
         return
     samples = samples or SAMPLES
     if particles > 1:
-        raise UsageError("--particles chooses among fillings of tables; leave it out for motion")
+        raise UsageError("--particles applies to tables only; leave it out for motion")
     check_files(out, None, ".npz")
     if out is None and filled is None:
         raise UsageError("impute writes a file; name it with --out or --filled")
@@ -462,7 +462,7 @@ def draw_futures(
 
 
 def _in_world(futures: motion.Forecasts, windows: motion.Windows, indices: Sequence[int]) -> motion.Forecasts:
-    """Return futures at the position, height and heading of their clips."""
+    """Return futures in world coordinates, with the position, height and heading of their clips."""
     names = ("forecasts", "observed", "truth")
     arrays: dict[str, Any] = {
         n: windows.to_world(torch.from_numpy(getattr(futures, n)), list(indices)).numpy() for n in names
@@ -471,7 +471,7 @@ def _in_world(futures: motion.Forecasts, windows: motion.Windows, indices: Seque
 
 
 def _fixed_joints(futures: motion.Forecasts) -> list[int]:
-    """Return the joints, except the root, that move equally in all futures of the first window, if it has several."""
+    """Return the joints, except the root, that are identical in all futures of the first window, if it has several."""
     sampled = futures.forecasts[:, 0]
     alike = (sampled == sampled[:1]).all((0, 1, 3)) & (len(sampled) > 1)
     return [joint for joint in np.flatnonzero(alike).tolist() if joint != futures.skeleton.root]

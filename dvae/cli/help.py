@@ -58,7 +58,7 @@ def command_stub(
         parameters.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
 
     def shown(**_: Any) -> None:
-        """Do nothing: only the help of this function is printed."""
+        """Do nothing; tyro prints the help of this function and never calls it."""
 
     shown.__doc__ = function.__doc__
     shown.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -67,7 +67,7 @@ def command_stub(
 
 
 def _with_default(hint: Any, default: Any, description: str | None = None) -> Any:
-    """Return the type of an option with its default in words, for defaults that are flags, missing or empty."""
+    """Return the type of an option, annotated with its default in words if that is a flag, missing or empty."""
     if not (default is None or isinstance(default, bool) or default in ((), "", {})):
         return hint
     words = description or (f"default: {_in_words(default)}" if isinstance(default, bool) else "optional")

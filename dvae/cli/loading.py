@@ -55,7 +55,7 @@ def load(path: Path, data: str | None, failed: bool = False) -> runs.Loaded:
     """Load a run of any kind, with a note if it has not finished.
 
     Raises:
-        ValueError: the run failed or has made no step, and `failed` is False.
+        ValueError: `failed` is False, and the run failed or has no optimiser step yet.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the note below covers more cases than the warning of `runs.load`
@@ -93,7 +93,10 @@ def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> An
         raise UsageError(f"--missing is for motion, and {widest.path} was fitted on a table; leave it out")
     if path is None:
         if missing and not widest.data.motion.missing:
-            raise UsageError("--missing is for other data (--data); the data of the run have no missing joints")
+            raise UsageError(
+                "--missing is for other data, because the data of the run have no missing joints; give other data with "
+                "--data, or leave --missing out"
+            )
         return widest.data
     other_data = widest.with_data(path, **({"missing": True} if missing else {}))
     if other_data.onto:
@@ -156,7 +159,7 @@ def with_equal_windows(
 
 
 def _cut(run: runs.Loaded) -> str:
-    """Return the name of the protocol, or how segments are cut."""
+    """Return the name of the protocol, or the description of how segments are cut."""
     return str(run.config.data.cut if run.config.kind == "segments" else run.schema.protocol.name)
 
 
@@ -174,7 +177,8 @@ def rows(loaded: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     """Group runs that differ only in the training seed.
 
     Returns:
-        {method, with its distinguishing options if methods repeat: runs}.
+        Dictionary from row name to runs. The name is the method, followed by the options that differ if several rows
+        have the same method.
 
     Raises:
         UsageError: two runs have the same options and seed.

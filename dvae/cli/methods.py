@@ -52,7 +52,7 @@ def show(
         inference: equation of the guide, such as "q(z_t | z_{t-1}, x_{t:T})"; "faithful" for a guide that ignores no
             dependency of the posterior, "" for a model without latents.
         steps: number of time steps in the figure.
-        summed: discrete latents of the model, which are summed out and have no factor in the guide.
+        summed: discrete latents of the model that are summed out; the guide has no factor for them.
         out: save the unrolled graphs of model and guide to this file (png, pdf, svg).
     """
     at_least(1, steps=steps)

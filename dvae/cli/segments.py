@@ -68,8 +68,8 @@ class Glimpse:
         frames: number of evenly spaced frames, of the 100 of a segment, to observe at unknown times; replaces --seconds
             and --fps.
         points: number of surface points observed at each time.
-        gaps: share of missing points or markers.
-        known_body: the shape of the body is given, and not inferred.
+        gaps: share of points or markers to remove, at least 0 and below 1.
+        known_body: whether the true body shape is given instead of inferred.
     """
 
     seen: Literal["surfaces", "points", "markers"] | None = None
@@ -86,7 +86,7 @@ class Glimpse:
             raise ValueError("--frames is for unknown times, --seconds and --fps are for known times; give only one")
 
     def of(self, model: Any, truth: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tensor]:
-        """Return the observations of x (B, N, D) and beta (B, S)."""
+        """Return simulated observations of segments, given their x (B, N, D) and beta (B, S)."""
         if self.seen is None:
             raise UsageError("--from requires --seen surfaces, points or markers")
         if self.seen != "points" and self.points != Glimpse.points:
@@ -97,7 +97,9 @@ class Glimpse:
         frames = None
         if self.frames is not None:
             if self.frames > model.timed.frames:
-                raise UsageError(f"--frames is {self.frames}; segments of this run have {model.timed.frames}")
+                raise UsageError(
+                    f"--frames is {self.frames}; segments of this run have {model.timed.frames} frames; give fewer"
+                )
             frames = np.linspace(0, model.timed.frames - 1, self.frames).round().tolist()
         options: dict[str, Any] = {"seconds": self.seconds, "frames": frames, "points": self.points, "gaps": self.gaps}
         observations = simulate_observations(model, x, shape, self.seen, fps=self.fps or 30.0, seed=seed, **options)
@@ -109,11 +111,11 @@ class Recovery:
     """Recovery of segments with a run of motion-latent.
 
     Args:
-        glimpse: simulated observations of known segments.
+        glimpse: options of simulated observations of known segments.
         deviations: standard deviations of the observations from the output of the model.
-        descent: optimisation of the most probable segments.
-        source: names of segments, or of takes, whose first segment is used; or split/name.
-        file: your own observations, instead.
+        descent: options of the optimisation that finds the most probable segments.
+        source: names of segments, or of takes, whose first segment is used; split/name if a name is not unique.
+        file: npz file of your own observations, instead of simulated ones.
         aggregate: use a normal distribution fitted to the latents of known segments as prior of z, instead of N(0, I).
     """
 
@@ -182,7 +184,7 @@ def _other_segments(data_set: Any, takes: Collection[str]) -> Mapping[str, Any] 
 
 
 def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:
-    """Yield warnings for readers of the table."""
+    """Yield warnings about the results, to print with the table."""
     remaining = recovered.completed.posterior.left
     if n_unconverged := int((remaining > APART).sum()):
         yield (

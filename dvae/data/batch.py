@@ -13,10 +13,11 @@ WHOLE = "x"
 
 
 class Batch(dict[str, Any]):
-    """Sequences by variable name, one per row: values (B, T, D) of local variables, (B, D) of static ones.
+    """A dictionary from variable name to values, with one sequence per row.
 
-    A batch is a dictionary, which users and data loaders can create. Five names are not variables; the attributes below
-    read them. Operations keep the type: `batch | {...}`, `rows`, `map`.
+    Local variables have the shape (B, T, D), static ones (B, D). Users and data loaders can also pass a plain
+    dictionary. The five names in `reserved` are not variables; each has a property or method of the same name below.
+    `batch | {...}`, `rows` and `map` return a `Batch`.
 
     >>> batch = Batch(x=torch.zeros(2, 3, 1), lengths=torch.tensor([3, 2]))
     >>> batch.lengths.tolist(), batch.mask(), batch.rows(slice(1))["x"].shape
@@ -25,7 +26,7 @@ class Batch(dict[str, Any]):
 
     reserved: ClassVar[tuple[str, ...]] = ("lengths", "mask", "group", "log_det", "view_inputs")
     reader: Any = None
-    """Identifier of the model that has read the batch and need not read it again; None after an entry was set."""
+    """Identifier of the model that already prepared this batch (`DynamicalVAE.read`); setting an entry resets it."""
 
     @property
     def lengths(self) -> Any:
@@ -39,12 +40,12 @@ class Batch(dict[str, Any]):
 
     @property
     def log_det(self) -> Any:
-        """Log-determinant of a view that changes volume, (B,) or by step (B, T); None if it is 0."""
+        """Log-determinant of the view's Jacobian, (B,) or (B, T) by step; None if the view keeps volume."""
         return self.get("log_det")
 
     @property
     def volume(self) -> Any:
-        """`log_det` summed over steps, (B,); None if it is 0."""
+        """`log_det` of each sequence, summed over steps, (B,); None if the view keeps volume."""
         return self.log_det.sum(-1) if self.log_det is not None and self.log_det.dim() == 2 else self.log_det
 
     @property
@@ -59,21 +60,21 @@ class Batch(dict[str, Any]):
         return "lengths" in self or "mask" in self
 
     def masks(self, whole: str = WHOLE) -> dict[str, Any]:
-        """Return the masks by variable.
+        """Return the masks as a dictionary from variable name to mask.
 
         Args:
-            whole: name of the variable that owns a mask without a name.
+            whole: name of the variable to which the mask applies if the batch has a single mask instead of a mapping.
         """
         mask = self.get("mask", {})
         return dict(mask) if isinstance(mask, Mapping) else {whole: mask}
 
     def mask(self, name: str = WHOLE) -> Any:
-        """Return True where a variable was observed, in the shape of its values; None if all entries were observed."""
+        """Return a variable's mask, in the shape of its values: True where an entry was observed; None if all were."""
         mask = self.get("mask")
         return mask.get(name) if isinstance(mask, Mapping) else mask
 
     def mask_to_nan(self) -> Tensor:
-        """Return x (B, T, D), NaN where it was not observed."""
+        """Return x (B, T, D), with NaN at entries that were not observed."""
         x: Tensor = self[WHOLE]
         mask = self.mask()
         return x if mask is None else torch.where(mask, x, torch.nan)
@@ -89,7 +90,10 @@ class Batch(dict[str, Any]):
         return selected
 
     def past(self, observed: int) -> Batch:
-        """Return the input of a forecast: all context, and the first frames of x, its mask and `view_inputs`."""
+        """Return the input of a forecast: x, its mask and `view_inputs` are cut to the first `observed` frames.
+
+        Context keeps all its steps.
+        """
         observable = Batch({name: self[name] for name in (WHOLE, "mask", "view_inputs") if name in self})
         return self | observable.map(lambda value: value[:, :observed])
 

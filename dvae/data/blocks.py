@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 NUMBERS = 2**17
-"""Numbers in a block: copies in double precision, a megabyte each, fit into a processor's cache."""
+"""Number of values in a block: in double precision they take one megabyte, which fits into a processor's cache."""
 
 
 def ranges(values: np.ndarray | Tensor) -> Iterator[slice]:
@@ -50,9 +50,9 @@ def cut_windows(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, len
 
     Args:
         arrays: arrays with rows of one shape.
-        which: (B,) indices of arrays.
-        starts: (B,) first rows.
-        lengths: (B,) numbers of rows, or one number for all; shorter windows repeat their last row.
+        which: (B,) index of each window's array.
+        starts: (B,) first row of each window in its array.
+        lengths: (B,) number of rows of each window, or one number for all; shorter windows repeat their last row.
     """
     steps = [lengths] * len(which) if isinstance(lengths, int) else lengths.tolist()
     dtype = np.result_type(np.float32, *{values.dtype for values in arrays})
@@ -65,7 +65,7 @@ def cut_windows(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, len
 
 @dataclass(frozen=True, eq=False)
 class ColumnSummary:
-    """Statistics of columns, (C,) each, without NaN.
+    """Statistics of each column of an array, (C,) each, which ignore NaN.
 
     Args:
         count: number of values.
@@ -84,7 +84,7 @@ class ColumnSummary:
         """Summarise all rows of parts (n, C), each read once, in double precision.
 
         Raises:
-            ValueError: without any part.
+            ValueError: if there are no parts.
         """
         total: ColumnSummary | None = None
         for part in parts:

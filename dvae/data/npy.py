@@ -30,7 +30,7 @@ NOTHING = 2**20
 
 
 class NpyError(ValueError):
-    """A file is damaged, or its content is not data."""
+    """Error for a file that is damaged or contains something other than plain data."""
 
 
 def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any]:
@@ -52,7 +52,7 @@ def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any
         raise NpyError(f"damaged, or not a plain array: the header of its npy file is {text[:100]!r}")
     lengths = [length.strip().removesuffix("L") for length in match["shape"].split(",") if length.strip()]
     if not all(re.fullmatch(r"\d{1,18}", length) for length in lengths):
-        raise NpyError(f"damaged: its shape is ({match['shape'][:100]})")
+        raise NpyError(f"damaged: its shape is ({match['shape'][:100]}), expected whole numbers")
     return dtype_of(match["descr"]), tuple(map(int, lengths)), "F" if match["order"] == "True" else "C"
 
 
@@ -68,22 +68,32 @@ def dtype_of(code: str) -> np.dtype:
 
 
 def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = "declares") -> None:
-    """Check that the shape matches the number of bytes; also refuse an empty array with very large dimensions."""
+    """Check that an array's shape matches its number of bytes.
+
+    Args:
+        dtype: type of the entries.
+        shape: shape of the array.
+        size: number of bytes of the entries.
+        verb: verb before the shape in errors.
+
+    Raises:
+        NpyError: if the number of bytes differs, or an empty array has very large dimensions.
+    """
     n_bytes, padded = prod(shape) * dtype.itemsize, prod(n or 1 for n in shape) * dtype.itemsize
     if len(shape) > 32 or n_bytes != size or padded > max(size, NOTHING):
-        short = f", needs {n_bytes:,}; it was cut short, copy or write it again" if n_bytes > size else ""
-        raise NpyError(f"{verb} shape {shape} of {dtype}, holds {size:,} bytes{short}")
+        short = f" instead of {n_bytes:,}; it was cut short, so copy or write it again" if n_bytes > size else ""
+        raise NpyError(f"{verb} shape {shape} of {dtype}, but holds {size:,} bytes{short}")
 
 
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
-    """Return the numbers of an npy file as a read-only memory map; data are read on use.
+    """Return the numbers of an npy file as a read-only memory map; values are read from disk when they are used.
 
     If another process truncates the file, the program crashes. If the file is replaced, as `files.atomic_write` does,
     the map keeps the old content.
 
     Args:
         path: the file.
-        links: follow a link, for a path that the user typed.
+        links: whether to follow a symbolic link, for a path that the user typed.
 
     Raises:
         ValueError: if the path is a link or not a file, or the file is truncated or not an npy file of real numbers in
@@ -121,8 +131,8 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
             raise
         raise OSError(
             error.errno,
-            "every mapped file stays open, and the limit of open files is reached (ulimit -n); write fewer, longer "
-            "ones",
+            "the limit of open files is reached, because every mapped file stays open; raise the limit (ulimit -n), or "
+            "write fewer, longer files",
             path,
         ) from error
 

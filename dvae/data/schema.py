@@ -17,7 +17,7 @@ from .views import View
 
 
 class SchemaError(ValueError):
-    """The schema misses information that a method requires."""
+    """Error for a schema without information that a method requires."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Schema:
 
     kind: ClassVar[str] = "sequences"
     per: ClassVar[str] = "step"
-    """Unit of bounds."""
+    """Unit of time of bounds, which are reported in nats per step, frame or window."""
 
     sizes: Mapping[str, Size]
     length: Frames | None = None
@@ -66,17 +66,17 @@ class Schema:
 
     @property
     def indicators(self) -> tuple[str, ...]:
-        """Names of data with missing training entries; guides read their indicators, as in `DynamicalVAE`."""
+        """Names of data variables with missing training entries; guides read their indicators (`DynamicalVAE`)."""
         return ()
 
     @property
     def together(self) -> Sequence[int]:
-        """A label for each coordinate of x; coordinates with equal labels are observed or missing together."""
+        """Label of each coordinate of x; coordinates with equal labels are always observed or missing together."""
         return [0] * self.size("x")
 
     @property
     def units(self) -> Mapping[str, Sequence[Coordinate]]:
-        """Variable to the units of its coordinates."""
+        """Dictionary from variable name to the units of its coordinates."""
         return {}
 
     def size(self, name: str) -> int:
@@ -86,12 +86,14 @@ class Schema:
             SchemaError: if the size is unknown.
         """
         if name not in self.sizes:
-            raise SchemaError(f"sizes missing for {name}; given are {', '.join(self.sizes) or 'none'}")
+            raise SchemaError(
+                f"sizes missing for {name}; the schema has sizes of {', '.join(self.sizes) or 'no variable'}"
+            )
         return self.sizes[name]
 
     @property
     def windows(self) -> Schema:
-        """Schema of the same data without a view; runs with equal ones can be evaluated together."""
+        """Schema of the same data without a view; runs for which it is equal can be evaluated on the same windows."""
         return self
 
     @classmethod

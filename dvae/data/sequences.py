@@ -1,4 +1,4 @@
-"""Protocols of data for training, evaluation, comparison and criticism, and sequences in memory.
+"""Protocols of data for training, evaluation, comparison and model criticism, and sequences in memory.
 
 A batch is a `Batch`, or a dictionary that can become one. Local variables have the shape (B, T, D), static ones (B, D).
 "lengths" (B,) counts the valid frames of right-padded sequences. "mask" (B, T, D) is True where an entry of the
@@ -8,9 +8,9 @@ inputs of some views, such as the rotations of joints in addition to their posit
 | used by | protocol |
 |---|---|
 | training | `Source`: draws batches |
-| validation | `Batched`: iterates over batches of sequences; or the same as comparison |
+| validation | `Batched`: iterates over batches of sequences; or any data for comparison |
 | comparison | `Listed`: returns all sequences at once; or arrays, or a batch |
-| evaluation and criticism | `HeldOutWindows`: listed windows with a past, names and a fingerprint |
+| evaluation and model criticism | `HeldOutWindows`: listed windows with a past, names and a fingerprint |
 
 `ArrayWindows` and `Sequences` implement them for arrays. Arrays may be mapped from disk (`numpy.memmap`) and are then
 read on demand.
@@ -38,7 +38,7 @@ class Source(Protocol):
     """Training data: an object that draws batches, such as windows of sequences."""
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Mapping[str, Any]:
-        """Return a batch, drawn with the generator alone."""
+        """Return a random batch; the generator is the only source of randomness."""
 
 
 @runtime_checkable
@@ -75,7 +75,7 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
 
     @property
     def protocol(self) -> Any:
-        """A dataclass with `observed` (frames).
+        """A dataclass with the attribute `observed`, the number of observed frames.
 
         `observed` is None for whole sequences, which have bounds but no forecasts.
         """
@@ -88,32 +88,36 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
     def description(self) -> Mapping[str, Any]:
         """Further information on the data, in JSON types; every entry is optional.
 
-        "title" lists phrases for titles. "columns" {name: unit} names the coordinates of x in their order, with units
-        for tables, "" for none. In the same order, "means" are subtracted from the numbers and "scales" divide them to
-        remove units. "season" is a period of the data in steps, for a reference row. "called" gives the words for a
-        cluster of windows and for a step; by default ["sequence", "step"].
+        "title" lists phrases for titles. "columns" is a dictionary from the name of each coordinate of x, in order, to
+        the unit that tables print, "" for none. To remove units from a coordinate, its entry of "means" is subtracted
+        and the result is divided by its entry of "scales". "season" is the period of the data in steps, for a reference
+        row of the results. "called" is a list of the words for a cluster of windows and for a step, by default
+        ["sequence", "step"].
         """
 
 
 def clusters(windows: Any) -> list[tuple[str, str, int]]:
-    """Return keys of windows that identify independent units: clips, unless the windows define `clusters`."""
+    """Return the cluster of each window: `clusters` if the windows define it, otherwise `keys`, which give the clip.
+
+    Windows of different clusters are independent.
+    """
     return list(getattr(windows, "clusters", None) or windows.keys)
 
 
 def axis_names(metadata: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the words for a cluster of windows and for a step in a description of windows."""
+    """Return the words for a cluster of windows and for a step, from a description of windows or their defaults."""
     cluster, step = metadata.get("called", ("sequence", "step"))
     return cluster, step
 
 
 def columns_of(windows: HeldOutWindows) -> Mapping[str, str]:
-    """Return the unit of every named column of x; empty if the windows have no column names."""
+    """Return a dictionary from column of x to unit of measurement; empty if the columns have no names."""
     columns: Mapping[str, str] = windows.description.get("columns", {})
     return columns
 
 
 def scales_of(windows: HeldOutWindows) -> Sequence[float]:
-    """Return the scales of the windows, which make columns comparable, if units differ; otherwise none."""
+    """Return the scales that make columns with different units comparable; empty if all units are equal."""
     units = [*columns_of(windows).values()]
     differ = len(units) > 1 and (len({*units}) > 1 or "" in units)
     return windows.description.get("scales", ()) if differ else ()
@@ -121,7 +125,7 @@ def scales_of(windows: HeldOutWindows) -> Sequence[float]:
 
 @dataclass(frozen=True)
 class Sequences:
-    """N sequences, in memory or mapped.
+    """N sequences, in memory or mapped from disk.
 
     Args:
         batch: the variables, each with N rows.
@@ -190,8 +194,8 @@ class RandomMasking:
 
     Args:
         source: source of the batches.
-        share: share of hidden entries of x, half of them in whole steps and half singly.
-        together: a label for each coordinate of x; coordinates with equal labels are hidden together.
+        share: share of the entries of x to hide, half of them as whole steps and half as single entries.
+        together: label of each coordinate of x; coordinates with equal labels are hidden together.
     """
 
     source: Any
@@ -217,7 +221,7 @@ class RandomMasking:
 
 
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
-    """Return means over some dimensions, without NaN."""
+    """Return means of values over the dimensions `dims`, ignoring NaN."""
     means: Tensor = values.mean(dims)
     return values.nanmean(dims) if means.isnan().any() else means
 
@@ -436,7 +440,9 @@ def tensor_of(values: Any) -> Tensor:
         return values.clone() if values.is_inference() and not torch.is_inference_mode_enabled() else values
     values, mask = unmasked(values)
     if mask is not None:
-        raise TypeError('an array is masked; give values.filled(0), and ~values.mask as the "mask" of the batch')
+        raise TypeError(
+            'got a masked array (numpy.ma); give values.filled(0), and ~values.mask as the "mask" of the batch'
+        )
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")
         return torch.as_tensor(values)
@@ -512,13 +518,16 @@ class ArrayWindows:
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
-        """(split, group, first step) of every window; the first step is unknown here and 0."""
+        """("array", group name, 0) of every window; without group names, the group is the index of the window.
+
+        The last element would be the window's first step within its recording, which an array does not contain.
+        """
         groups = self.groups if self.groups is not None else range(len(self.x))
         return [("array", str(group), 0) for group in groups]
 
     @property
     def description(self) -> dict[str, Any]:
-        """Columns and season, and the word for a group, if they were given."""
+        """The entries "columns", "season" and "called", each only if the windows have columns, a season or groups."""
         description: dict[str, Any] = {
             "columns": None if self.columns is None else dict(self.columns),
             "season": self.season,

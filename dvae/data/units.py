@@ -32,7 +32,7 @@ ROUNDING = 2e-15
 RESOLVED = 6e-6
 """Ratio of standard deviation to mean below which float32 loses more than a hundredth of the deviation."""
 SMALLEST = 1e-18
-"""Smallest standard deviation, such that the inverse of its square is a float32."""
+"""Smallest supported standard deviation; the inverse of its square is still a finite float32."""
 TOO_SMALL = f"models compute in float32, which needs at least {SMALLEST:g}; multiply the values by a constant"
 
 
@@ -41,13 +41,25 @@ LEVELS = "subtract from each sequence its own mean, or fit in float64"
 
 
 def is_imprecise(summary: ColumnSummary, center: Any) -> np.ndarray:
-    """Return whether columns vary, but by less than float32 resolves at their distance from a center."""
+    """Return whether each column varies by less than float32 resolves at its distance from a center, (C,).
+
+    The result is False for constant columns.
+
+    Args:
+        summary: statistics of the C columns.
+        center: value (C,) that is subtracted from each column in float64.
+    """
     spread = np.sqrt(summary.variance)
     return (spread > ROUNDING * abs(summary.mean)) & (spread < RESOLVED * abs(summary.mean - center))  # type: ignore[no-any-return]
 
 
 def imprecise_sequences(values: Tensor | np.ndarray, center: Any) -> np.ndarray:
-    """Return `is_imprecise` (N, D) for the coordinates of each sequence (N, T, D), read in blocks."""
+    """Return `is_imprecise` (N, D) for each coordinate of each sequence.
+
+    Args:
+        values: (N, T, D), in memory or mapped; read in blocks.
+        center: value (D,) that is subtracted from each coordinate in float64.
+    """
     masks = []
     for block in blocks(values):
         count, _, size = block.shape
@@ -68,7 +80,7 @@ class Coordinate(NamedTuple):
     Args:
         mean, scale: mean and scale that standardise the values.
         typical: replacement for a missing value.
-        floor: smallest value whose logarithm is read; 0 to read values instead of logarithms.
+        floor: lower limit to which values are clipped before networks read their logarithms; 0 if networks read values.
         level, spread: mean and standard deviation of the logarithms.
     """
 
@@ -85,7 +97,9 @@ EXACT = ("mean", "typical")
 
 
 class Units(nn.Module):
-    """A mean for every coordinate and one scale for all, which preserves angles; 0 and 1 until `fit`.
+    """Standardisation with a mean for every coordinate and one common scale, which preserves angles.
+
+    Means are 0 and the scale is 1 until `fit` is called.
 
     Args:
         size: D.
@@ -117,7 +131,7 @@ class Units(nn.Module):
         Warns if float32 does not resolve how sequences (N, T, D) vary after their common mean is subtracted.
 
         Raises:
-            ValueError: if the values do not vary or have another size, or coordinates were given their units.
+            ValueError: if the values do not vary or have another size, or the units of the coordinates were given.
         """
         if self.scale.dim():
             raise ValueError("these coordinates have given units, which cannot be fitted; remove the call of fit")
@@ -148,7 +162,7 @@ class Units(nn.Module):
 
     @property
     def wide(self) -> bool:
-        """Whether values are in float64 and the model is not."""
+        """Whether values are read in float64 although the model has another precision."""
         return self.mean.dtype is torch.float64 is not self.scale.dtype
 
     @override

@@ -50,6 +50,11 @@ class View:
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         """Check that a model is compatible with this view.
 
+        Args:
+            sizes: dimension of every variable of the model.
+            context: names of the model's context.
+            generative: generative factorization.
+
         Raises:
             ValueError: if the model is incompatible; the message states the reason.
         """
@@ -59,7 +64,7 @@ class View:
 
         Args:
             data: values (B, ...) by name.
-            view_inputs: a transformed batch, if `data` continue its sequences.
+            view_inputs: the batch of the past, already transformed, if `data` continue the sequences of this batch.
 
         Raises:
             ValueError: if the data cannot be transformed.
@@ -67,14 +72,18 @@ class View:
         return data
 
     def inverse(self, seen: Batch) -> Batch:
-        """Return the data from their representation: values (..., B, T, D), and additions of the view (B, ...)."""
+        """Map values from the model's representation back to the data.
+
+        Args:
+            seen: values (..., B, T, D) by name, and the values (B, ...) that the view added.
+        """
         return seen
 
     def log_det(self, data: Batch) -> Tensor:
         """Return the log absolute determinant of the Jacobian, (B,); 0 for a view that keeps volume.
 
-        A view that transforms each entry of x separately returns it by entry, (B, T, D); missing entries and padding do
-        not count. Any other view that changes volume requires complete data.
+        A view that transforms each entry of x separately returns a value for each entry, (B, T, D), and the sum omits
+        missing entries and padding. Any other view that changes volume requires complete data.
         """
         some = next(iter(data.values()))
         zeros: Tensor = some.new_zeros(len(some))
@@ -86,10 +95,13 @@ class View:
         return type(self).log_det is View.log_det
 
     def counted(self, data: Batch) -> Tensor:
-        """Return `log_det` summed over observed entries: by step (B, T) if it is by entry, else (B,).
+        """Return `log_det` without missing entries and padding.
+
+        It is summed over coordinates, (B, T), if the view returns a value for each entry; otherwise it is (B,).
 
         Raises:
-            ValueError: if it is not by entry and some entries are missing or padding, or if its shape is invalid.
+            ValueError: if the view returns one value per sequence, but some entries are missing or padding, or if the
+                shape is invalid.
         """
         log_det = self.log_det(data)
         if log_det.dim() == 1 and not data.partial:
@@ -129,7 +141,7 @@ class Views(View):
         *views: views in the order from the data to the model.
 
     Raises:
-        ValueError: if a `Past`, which is not scored, follows a view that changes volume.
+        ValueError: if a `Past` follows a view that changes volume; the steps of a `Past` are not scored.
     """
 
     def __init__(self, *views: View):
@@ -187,7 +199,7 @@ class Parts(View):
     """Data variables that are coordinates of one array x, which represents all of them in batches and forecasts.
 
     Args:
-        parts: variable to its coordinates. Every coordinate belongs to exactly one variable.
+        parts: dictionary from variable name to its coordinates of x. Every coordinate belongs to exactly one variable.
 
     Example:
         >>> view = Parts({"legs": [0, 2], "arms": [1]})
@@ -205,7 +217,7 @@ class Parts(View):
             raise ValueError(f"the parts must contain each coordinate 0, 1, ... of x exactly once; got {coordinates}")
         for name, part in self.parts.items():
             if len(part) != sizes[name]:
-                raise ValueError(f"the part {name} has {len(part)} coordinates, but its size is {sizes[name]}")
+                raise ValueError(f"the part {name} has {len(part)} coordinates, but sizes has {name}={sizes[name]}")
         if WHOLE in sizes:
             raise ValueError(f"with parts, {WHOLE!r} names the whole array; rename the variable {WHOLE!r}")
 
@@ -238,7 +250,7 @@ class Parts(View):
 class History(View):
     """A copy of the data as a context variable.
 
-    Its relation must be a custom mask, such as h_{1:O}, that hides the frames to be generated.
+    Factors must read it through a custom mask, such as h_{1:O}, that hides the frames to be generated.
 
     Args:
         history: name of the context variable.
@@ -252,12 +264,14 @@ class History(View):
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         name = self.history
         if name not in context:
-            raise ValueError(f"the history is {name!r}, but the context is {', '.join(context) or 'none'}")
+            raise ValueError(
+                f"the history {name!r} must be context of the model, which has {', '.join(context) or 'no context'}"
+            )
         for factor in generative.factors:
             parent = factor.parent(name)
             if parent is not None and (parent.relation is None or parent.relation.intervals is not None):
                 raise ValueError(
-                    f"{factor} reads {parent}, but {name} is the data, and a forecast has only their past; "
+                    f"{factor} reads {parent}, but {name} is a copy of the data, and a forecast has only their past; "
                     f"give {name} a custom mask that hides the steps to predict, such as "
                     f'{name}_{{1:O}} with masks={{"1:O": lambda T: np.arange(T)[None] < 15}}'
                 )
@@ -275,13 +289,13 @@ class History(View):
 class Past(View):
     """The first frames of x as a static variable, which the other frames continue.
 
-    A model with this view generates only the future. Bounds refer to the future given the past. Forecasts have no other
-    data, and their latents come from the prior.
+    A model with this view generates only the future. Bounds refer to the future given the past. A forecast observes
+    only the past, so its latents come from the prior.
 
     Args:
         name: name of the past, (B, O D), frame after frame.
-        frames: O.
-        also: names of context over the same frames, cut in the same way.
+        frames: O, number of first frames.
+        also: names of local context over the same frames as x; their first O frames are removed.
 
     Example:
         >>> {name: tuple(value.shape) for name, value in Past("s")(Batch(x=torch.zeros(2, 5, 3))).items()}
@@ -305,7 +319,7 @@ class Past(View):
             raise ValueError("a view with `Past` requires windows of one length; remove 'lengths' from the batch")
         x, masks, frames = data[WHOLE], data.masks(), self.frames
         if x.shape[1] < frames:
-            raise ValueError(f"this model continues from {frames} steps, but was given {x.shape[1]}")
+            raise ValueError(f"this model requires at least {frames} observed steps, got {x.shape[1]}")
         for name in self.also:
             if name in data and data[name].shape[1] != x.shape[1] > frames:
                 raise ValueError(

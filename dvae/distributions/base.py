@@ -1,10 +1,11 @@
-"""The interface of conditional distributions: a specification, built for a shape, maps features to a distribution.
+"""Interface of conditional distributions: a specification builds a module, which maps features to a distribution.
 
-    DistributionSpec.build(Shape) -> Distribution        Distribution(features) -> parameters
-    Distribution.distribution(parameters) -> Pyro's
+    DistributionSpec.build(Shape)                                 returns a ConditionalDistribution
+    ConditionalDistribution.forward(features)                     returns parameters
+    ConditionalDistribution.distribution(parameters)              returns a Pyro distribution
 
-The parameters are plain tensors, so a loop over time creates no distribution objects. For a variable without parents,
-the module has no features and learns the parameters itself; priors therefore use the same interface.
+The parameters are plain tensors, so a loop over time creates no distribution objects. For a model variable without
+parents, the module has no features and learns the parameters itself. Priors therefore have the same interface.
 """
 
 from __future__ import annotations
@@ -24,15 +25,16 @@ Parameters = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class Shape:
-    """The variable and features that a conditional distribution is built for.
+    """Properties of the variable and of the features for which a conditional distribution is built.
 
     Args:
         size: D, dimension of the variable.
-        features: H, number of features from the network; 0 for a model variable without parents.
-        local: True for one value per step, False for one per sequence.
+        features: H, number of features that the network returns; 0 for a model variable without parents.
+        local: True for one value per time step, False for one value per sequence (static).
         name: name of the variable.
-        data: names of the data variables.
-        guide: the `Conditional` q(w | ...) of a static latent without parents, for priors that are defined by it.
+        data: names of the data variables of the model.
+        guide: the `Conditional` q(w | ...) if the variable is a static latent w without parents, for priors that
+            evaluate it, such as `Vamp`; otherwise None.
     """
 
     size: int
@@ -46,55 +48,69 @@ class Shape:
 class ConditionalDistribution(nn.Module):
     """A module that maps features to the conditional distribution of one variable.
 
-    Subclasses implement `forward` and `distribution`. They declare `support`, `event_dim`, `discrete` and
-    `reparameterised` if these differ from independent normals.
+    Subclasses implement `forward` and `distribution`. They also declare `support`, `event_dim`, `discrete` and
+    `reparameterised` if the defaults, which describe independent normals, do not hold.
 
     Args:
-        residual: share of the variable's previous value that is added to the location; the features provide the rest.
-            With 1 (True) the features are an offset. Below 1, a free-running forecast forgets its start and cannot
-            drift without bound. The initial weights of a residual location are a hundredth of their usual size.
+        residual: share of the variable's previous value that is added to the location, from 0 to 1; the features
+            provide the rest. With 1 (or True), the features provide the change from one step to the next. Below 1, a
+            free-running forecast forgets its start and cannot drift without bound. The initial weights of a residual
+            location are a hundredth of their usual size.
 
     Raises:
         ValueError: `residual` is not between 0 and 1.
     """
 
     support: Any = constraints.real
-    """torch's constraint on the values of a step; None if it depends on the parameters."""
+    """Constraint of torch on the values (D,) of a step; None if it depends on the parameters."""
     event_dim: int = 0
-    """1 if all coordinates of a step are one event, 0 if each coordinate has its own density."""
+    """1 if all D coordinates of a step are one event with one density, 0 if each coordinate has its own density."""
     discrete: bool = False
-    """Whether values are discrete."""
+    """Whether the values are discrete, such as counts or classes."""
     reparameterised: bool = True
-    """Whether gradients flow through draws."""
+    """Whether draws are differentiable with respect to the parameters."""
     deterministic: ClassVar[bool] = False
-    """Whether the variable is a function of its parents and has no density."""
+    """Whether the variable is a function of its parents, so that it has no density."""
     error_weight: bool = False
-    """Whether the scale is the weight of a squared error, not the spread of the data; forecasts then show the mean."""
-    location_scale: bool = False
-    """Whether `rescale` can convert the parameters to another unit.
+    """Whether the scale only weights a squared error and does not describe the spread of the data.
 
-    This requires a location and a scale, or a scale alone such as a rate; probabilities cannot be converted.
+    Forecasts then return the mean instead of draws.
+    """
+    location_scale: bool = False
+    """Whether `rescale` can convert the parameters to another unit of the variable.
+
+    This requires a location and a scale, or a scale alone, such as a rate. Probabilities cannot be converted.
     """
     centred: bool | Sequence[bool] = False
-    """Whether `rescale` adds the mean, so that the network can work with values minus their mean; or a flag for each
-    coordinate.
+    """Whether `rescale` adds the mean of the variable to the location, for all coordinates or for each of them.
+
+    If it does, the parameters can describe values minus their mean.
     """
     events: Sequence[Sequence[int]] = ()
-    """Groups of coordinates that are one event each, if there are several; observed completely or not at all."""
+    """Indices of the coordinates of each event if a step has several events, as in a `Product`.
+
+    An event has one density, so its coordinates are either all observed or all missing.
+    """
 
     def __init__(self, residual: float = False):
         super().__init__()
         if not 0 <= residual <= 1:
-            raise ValueError(f"residual must be a share of the previous value, from 0 to 1, got {residual}")
+            raise ValueError(
+                f"`residual` must be from 0 to 1 (share of the previous value that is added), got {residual}"
+            )
         self.residual = float(residual)
 
     @property
     def label(self) -> str:
-        """Name of the distribution in messages."""
+        """Name of the distribution in error messages."""
         return type(self).__name__.removesuffix("Distribution")
 
     def interior_point(self, size: int) -> Tensor | None:
-        """Return a value (D,) with positive density to fill unobserved entries; None if 0 has positive density."""
+        """Return a value (D,) with positive density that replaces unobserved entries; None if 0 can replace them.
+
+        Args:
+            size: D, dimension of the variable.
+        """
         if self.support is None or is_real(self.support):
             return None
         if not self.support.is_discrete:
@@ -103,9 +119,13 @@ class ConditionalDistribution(nn.Module):
         return None if self.support.check(zero).all() else functional.one_hot(torch.tensor(0), size).to(zero)
 
     def projection(self, features: int, out: int, locations: int) -> Any:
-        """Return a layer from features to `out` parameters, the first `locations` of them locations.
+        """Return a linear layer from features to parameters; without features, a module with learned parameters.
 
-        Without features, the parameters are learned.
+        Args:
+            features: H, number of features.
+            out: P, number of parameters.
+            locations: number of locations, which come first among the parameters. With `residual`, their initial
+                weights are small.
         """
         if not features:
             return Unconditional(out)
@@ -117,56 +137,95 @@ class ConditionalDistribution(nn.Module):
         return layer
 
     def add_residual(self, loc: Tensor, previous: Tensor | None) -> Tensor:
-        """Return the location: the output of the features plus `residual` times the previous value."""
+        """Return the location (..., D) of a residual distribution.
+
+        Args:
+            loc: location (..., D) computed from the features.
+            previous: previous values (..., D), which are multiplied by `residual` and added; None to add nothing.
+        """
         return loc if previous is None else torch.add(loc, previous, alpha=self.residual)
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """Return the parameters, (..., P) each, from features and, if residual, the variable's previous value.
+        """Return the parameters of the distribution, a tuple of tensors (..., P); P may differ between parameters.
 
         Args:
-            features: (B, T, H) at all steps or at T steps from `t` on; (B, H) for a static variable or at step `t`.
-            previous: (B, T, D) or (B, D).
-            t: the step in a loop over time, or the first of several steps.
+            features: (B, T, H) at all steps, or at T steps from step `t` on; (B, H) for a static variable, or for a
+                local variable at step `t`.
+            previous: values of the variable one step earlier, (B, T, D) or (B, D), for a residual distribution;
+                otherwise None.
+            t: step in a loop over time, or the first of several steps, counted from 0; None for all steps.
         """
         raise NotImplementedError
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """Return the distribution of a value (..., D).
+        """Return the Pyro distribution of values (..., D).
 
-        It has either one density per coordinate (batch (..., D), no event) or one density per step (batch (...), event
-        (D,)).
+        It has one density per coordinate (batch shape (..., D), event shape ()) if `event_dim` is 0, or one density per
+        step (batch shape (...), event shape (D,)) if it is 1.
+
+        Args:
+            parameters: result of `forward`.
         """
         raise NotImplementedError
 
     def mean(self, parameters: Parameters) -> Tensor:
-        """Return the mean (..., D). The model uses it for missing data and for forecasts that are not drawn.
+        """Return the mean (..., D), by default the first parameter.
 
-        For a categorical variable it contains the probabilities. The default is the first parameter.
+        The model uses the mean for missing data and for forecasts that are not drawn. The mean of a categorical
+        variable consists of the probabilities of its classes.
+
+        Args:
+            parameters: result of `forward`.
         """
         return parameters[0]
 
     def joint(self, parameters: Parameters) -> TorchDistribution:
-        """Return the distribution with all coordinates as one event: batch (...), event (D,)."""
+        """Return the distribution with all coordinates as one event: batch shape (...), event shape (D,).
+
+        Args:
+            parameters: result of `forward`.
+        """
         distribution = self.distribution(parameters)
         return distribution.to_event(1 - len(distribution.event_shape))
 
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """Convert parameters of a variable to parameters of mean + scale * variable, for a location-scale family."""
+        """Convert the parameters of a variable to the parameters of mean + scale * variable.
+
+        This default converts a location and a scale, and leaves any further parameters unchanged. The model calls it
+        only if `location_scale` is True.
+
+        Args:
+            parameters: result of `forward`.
+            mean: mean of the variable in its own unit, (D,).
+            scale: scale of the variable in its own unit, (D,) or a single number.
+        """
         loc, *rest = parameters
         return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
 
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """Return noise for all steps at once; `draw` transforms it into values."""
+        """Return noise for all steps at once, by default standard normal; `draw` transforms it into values.
+
+        Args:
+            shape: shape of the noise, such as (B, T, D).
+            like: tensor that defines dtype and device.
+        """
         return torch.randn(*shape, dtype=like.dtype, device=like.device)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Return values (..., D), reparameterised if possible; `noise` is ignored if the distribution draws its own."""
+        """Return a draw (..., D), differentiable with respect to the parameters if possible.
+
+        This default ignores the noise and lets the Pyro distribution draw.
+
+        Args:
+            parameters: result of `forward`.
+            noise: noise (..., D) from `noise`.
+        """
         distribution = self.distribution(parameters)
         return distribution.rsample() if distribution.has_rsample else distribution.sample()
 
 
 def is_real(support: Any) -> bool:
-    """Return whether a constraint allows all real numbers."""
+    """Return whether a constraint of torch allows all real numbers in every coordinate."""
     while hasattr(support, "base_constraint"):
         support = support.base_constraint
     parts = getattr(support, "parts", ())  # only a ProductSupport has parts
@@ -177,17 +236,28 @@ class DistributionSpec(Protocol):
     """Specification of a conditional distribution: a frozen dataclass with a `build` method."""
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable; raise ValueError if the distribution does not support its shape."""
+        """Return the module for a variable.
+
+        Args:
+            shape: the variable and its features.
+
+        Raises:
+            ValueError: the distribution does not support this variable.
+        """
         ...
 
 
 class Unconditional(nn.Module):
-    """Learned parameters (..., P) that do not depend on the features; initially 0."""
+    """Learned parameters that do not depend on the features; initially 0.
+
+    Args:
+        out: P, number of parameters.
+    """
 
     def __init__(self, out: int):
         super().__init__()
         self.bias = nn.Parameter(torch.zeros(out))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Expand the parameters to the batch shape of the features."""
+        """Return the parameters, expanded to (..., P), for features (..., H) whose values are ignored."""
         return self.bias.expand(*features.shape[:-1], -1)

@@ -1,6 +1,6 @@
 """A Gaussian chain as one autograd function: the sequential loop over z_{t-1} in the guide of a state-space model.
 
-Everything else is computed before the loop, so a step is
+All terms that do not depend on z_{t-1} are computed before the loop. A step of the loop is
 
     f_t = features of z_{t-1}, 0 at the first step                        layers `before`; z_{t-1} itself without them
     h_t, c_t = LSTM([f_t, h_{t-1}], c_{t-1})                              if there is a cell; otherwise h_t = f_t
@@ -39,18 +39,22 @@ def gaussian_chain(
     min_scale: float = 0.0,
     activation: str = "tanh",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Return draws of a Gaussian chain, locations and scales, (T, B, D), and the states h (T, B, W) if it has a cell.
+    """Draw from a Gaussian chain.
 
     Args:
-        base: (T, B, H) contribution of known inputs to the first of `layers`, bias included.
-        noise: (T, B, D) standard normal.
-        layers: weight (out, in) and bias (out,) of every layer from h_t to (loc, raw), with the activation between
-            layers. The bias of the first layer is part of `base`.
-        before: weight and bias of the layers on z_{t-1}, each followed by the activation.
-        cell: for an LSTM, (T, B, 4 W) contribution of known inputs to its gates, biases included, and the weight
-            (4 W, F + W) of [f_t, h_{t-1}]; gates in torch's order.
+        base: contribution (T, B, H) of the known inputs to the first of `layers`, including the bias of this layer.
+        noise: standard normal noise e (T, B, D).
+        layers: weight (out, in) and bias (out,) of each layer from h_t to (loc, raw), with the activation between two
+            layers. The bias of the first layer is ignored, because it is part of `base`.
+        before: weight and bias of each layer from z_{t-1} to f_t; the activation follows each of them.
+        cell: parameters of the LSTM, or None without an LSTM. The first item is the contribution (T, B, 4 W) of the
+            known inputs to the gates in torch's order, biases included. The second item is the weight (4 W, F + W) of
+            [f_t, h_{t-1}].
         min_scale: s, lower bound of the scale.
         activation: "tanh" or "relu".
+
+    Returns:
+        Draws z, locations and scales, (T, B, D) each, and the states h (T, B, W) of the LSTM or None.
     """
     gates, recurrent = cell or (None, None)
     (first, _), *rest = layers
@@ -74,7 +78,7 @@ class GaussianChain(torch.autograd.Function):
         first: Tensor,
         *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Run the chain.
+        """Return draws, locations, scales and states, as `gaussian_chain` does.
 
         (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
         """
@@ -174,7 +178,7 @@ class GaussianChain(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the gradients of base, gates, weights and biases for the gradients of all results.
+        """Return the gradients of base, gates, weights and biases, given the gradients of the results of `forward`.
 
         (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
         """
@@ -280,5 +284,10 @@ def _layers(tensors: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
 
 
 def _product(gradient: Tensor, entered: Tensor) -> Tensor:
-    """Return the gradient (H, F) of a weight from its inputs (T, B, F) and the gradients of its outputs (T, B, H)."""
+    """Return the gradient of a layer's weight, (H, F).
+
+    Args:
+        gradient: gradient of the layer's outputs, (T, B, H).
+        entered: inputs of the layer, (T, B, F).
+    """
     return gradient.flatten(0, 1).t() @ entered.flatten(0, 1)

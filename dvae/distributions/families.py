@@ -1,4 +1,4 @@
-"""Conditional distributions with parameters from features: normals, Student t and point masses."""
+"""Conditional distributions whose parameters are functions of features: normals, Student t and point masses."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 class NormalDistribution(dist.Normal):
-    """Normals with locations and scales (..., D) and a faster log density and KL divergence than torch's.
+    """Independent normals with locations and scales (..., D), with a faster log density and KL divergence than torch.
 
-    They compute each quotient once and reuse it, in place of squared scales. This saves 1 to 5 % of a training step of
-    STORN (docs/results/speed.md).
+    Both functions compute a quotient such as (value - loc) / scale once and reuse it, instead of squaring the scale.
+    This saves 1 to 5 % of a training step of STORN (docs/results/speed.md).
     """
 
     @override
@@ -40,28 +40,39 @@ def _divergence(q: NormalDistribution, p: NormalDistribution) -> Tensor:
 
 
 class Gaussian(ConditionalDistribution):
-    """Base of distribution modules for independent normals; the parameters are locations and scales, (..., D) each."""
+    """Base class of modules for independent normals, with parameters location (..., D) and scale (..., D)."""
 
     location_scale = True
     centred = True
 
     def distribution(self, parameters: Parameters) -> TorchDistribution:
-        """Return the normals."""
+        """Return independent normals: batch shape (..., D), event shape ().
+
+        Args:
+            parameters: location and scale, (..., D) each.
+        """
         loc, scale = parameters
         return NormalDistribution(loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Return reparameterised values (..., D)."""
+        """Return the reparameterised draw loc + scale * noise, (..., D).
+
+        Args:
+            parameters: location and scale, (..., D) each.
+            noise: standard normal noise (..., D).
+        """
         loc, scale = parameters
         return torch.addcmul(loc, scale, noise)
 
 
 @dataclass(frozen=True)
 class Normal:
-    """A diagonal normal with location and scale from the features, or learned without features.
+    """Independent normals whose locations and scales are functions of the features.
+
+    For a model variable without parents, locations and scales are learned.
 
     Args:
-        min_scale: lower bound of the scale; without one, the likelihood may be unbounded.
+        min_scale: lower bound of the scale; with a bound of 0, the likelihood may be unbounded.
         residual: share of the previous value, as in `ConditionalDistribution`.
     """
 
@@ -74,7 +85,7 @@ class Normal:
 
 
 class NormalModule(Gaussian):
-    """Distribution module of `Normal`."""
+    """Distribution module of `Normal`; its parameters are location (..., D) and scale (..., D)."""
 
     def __init__(self, spec: Normal, shape: Shape):
         super().__init__(spec.residual)
@@ -91,17 +102,21 @@ class NormalModule(Gaussian):
 
 @dataclass(frozen=True)
 class FixedNormal:
-    """A normal with a scale that does not depend on the parents. Without parents, its location is learned too.
+    """Independent normals whose scales do not depend on the parents.
+
+    The location is a function of the features, or learned for a model variable without parents.
 
     Args:
-        scale: standard deviation; the initial value if it is learned.
-        learned: whether to learn one scale per dimension.
+        scale: standard deviation, above 0; the initial value if it is learned.
+        learned: whether to learn the scale, with one value per dimension.
         project: whether a linear layer maps features to the location; if False, the features are the location.
-        steps: with `learned`, the maximum number of time steps, with one scale per step; for a local variable only.
+        steps: maximum number of time steps, each with a scale of its own (useful with `learned`); 0 for the same scale
+            at all steps. A static variable requires 0.
         residual: share of the previous value, as in `ConditionalDistribution`.
-        fitted: what receives the gradient of the density: "both", or "scale" if the location learns from energies only.
-        error_weight: whether the scale is the weight of a squared error, not the spread of the data; forecasts then
-            show the location.
+        fitted: parameters that receive the gradient of the log density: "both", or "scale" for the scale alone. With
+            "scale", the location learns only from other terms of the loss, such as energies.
+        error_weight: whether the scale only weights a squared error and does not describe the spread of the data;
+            forecasts then return the location instead of draws.
     """
 
     scale: float = 1.0
@@ -113,23 +128,29 @@ class FixedNormal:
     error_weight: bool = False
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: `scale` is not positive, `steps` is given for a static variable, or the number of features is
+                not D although `project` is False.
+        """
         if self.scale <= 0:
-            raise ValueError(f"FixedNormal's scale must be positive, got {self.scale}")
+            raise ValueError(f"`scale` of FixedNormal must be positive, got {self.scale}")
         if self.steps and not shape.local:
             raise ValueError(
-                f"FixedNormal(steps={self.steps}) has one scale per time step, but its variable is static, with one "
-                "value per sequence; give static variables a distribution of their own, with steps=0"
+                f"FixedNormal(steps={self.steps}) has one scale per time step, but {shape.name} is static, with one "
+                f"value per sequence; use FixedNormal(steps=0) for {shape.name}"
             )
         if not self.project and shape.features != shape.size:
             raise ValueError(
-                f"a FixedNormal without projection takes {shape.size} features, but the network gives {shape.features}"
+                f"FixedNormal(project=False) requires {shape.size} features, the location of {shape.name}, but the "
+                f"network returns {shape.features}; use a network with {shape.size} outputs, or project=True"
             )
         return FixedNormalModule(self, shape)
 
 
 class FixedNormalModule(Gaussian):
-    """Distribution module of `FixedNormal`."""
+    """Distribution module of `FixedNormal`; its parameters are location (..., D) and scale (..., D)."""
 
     def __init__(self, spec: FixedNormal, shape: Shape):
         super().__init__(spec.residual)
@@ -145,7 +166,7 @@ class FixedNormalModule(Gaussian):
 
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """Convert the parameters; a scale that is not learned already has the unit of the variable."""
+        """Convert the location and a learned scale; a scale that is not learned is already in the variable's unit."""
         loc, rescaled = super().rescale(parameters, mean, scale)
         return loc, rescaled if self.learned else parameters[1]
 
@@ -161,14 +182,19 @@ class FixedNormalModule(Gaussian):
         if self.steps:
             first, end = t or 0, (t or 0) + (loc.shape[1] if loc.dim() == 3 else 1)
             if end > self.steps:
-                raise ValueError(f"FixedNormal(steps={self.steps}) was given {end} steps; build it with steps={end}")
+                raise ValueError(
+                    f"FixedNormal(steps={self.steps}) has no scales for {end} steps; build it with steps={end} or more"
+                )
             scale = scale[first:end] if loc.dim() == 3 else scale[first]
         return loc if previous is None else self.add_residual(loc, previous), scale.expand_as(loc)
 
 
 @dataclass(frozen=True)
 class KnownNoise:
-    """A normal with a given scale: the last D features, after the features of the network in `networks.WithNoise`.
+    """Independent normals with given scales, such as known measurement errors.
+
+    The network must be `networks.WithNoise`, which appends the given scale to its features: the last D features are the
+    scale, and a linear layer maps the other features to the location.
 
     Args:
         residual: share of the previous value, as in `ConditionalDistribution`.
@@ -177,16 +203,21 @@ class KnownNoise:
     residual: float = False
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: the features do not include a scale, because the network is not a `networks.WithNoise`.
+        """
         if shape.features <= shape.size:
             raise ValueError(
-                f"KnownNoise needs its scale from networks.WithNoise, as a network of p({shape.name} | ...)"
+                f"KnownNoise requires a network that appends {shape.size} scales to its features, but the network of "
+                f"{shape.name} returns only {shape.features} features; use networks.WithNoise"
             )
         return KnownNoiseModule(self, shape)
 
 
 class KnownNoiseModule(Gaussian):
-    """Distribution module of `KnownNoise`."""
+    """Distribution module of `KnownNoise`; its parameters are location (..., D) and scale (..., D)."""
 
     def __init__(self, spec: KnownNoise, shape: Shape):
         super().__init__(spec.residual)
@@ -195,7 +226,7 @@ class KnownNoiseModule(Gaussian):
 
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        """Convert the location; the scale already has the unit of the variable."""
+        """Convert the location; the given scale is already in the variable's unit."""
         return torch.addcmul(mean, parameters[0], scale), parameters[1]
 
     @override
@@ -206,10 +237,12 @@ class KnownNoiseModule(Gaussian):
 
 @dataclass(frozen=True)
 class StudentT:
-    """A Student t distribution for observations with outliers.
+    """Independent Student t distributions, for observations with outliers.
+
+    Location and scale are functions of the features; each dimension has learned degrees of freedom.
 
     Args:
-        df: initial degrees of freedom; one per dimension is learned and stays above 2.
+        df: initial degrees of freedom, above 2. The learned values also stay above 2, where the variance is finite.
         min_scale: lower bound of the scale.
         residual: share of the previous value, as in `ConditionalDistribution`.
     """
@@ -219,14 +252,21 @@ class StudentT:
     residual: float = False
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: `df` is at most 2.
+        """
         if self.df <= 2:
-            raise ValueError(f"StudentT needs df > 2, where the variance is finite; got {self.df}")
+            raise ValueError(f"`df` of StudentT must be above 2, where the variance is finite, got {self.df}")
         return StudentTModule(self, shape)
 
 
 class StudentTDistribution(dist.StudentT):  # type: ignore[misc]
-    """Student t distributions with degrees of freedom, locations and scales (..., D)."""
+    """Student t distributions with a log density that is accurate for large degrees of freedom.
+
+    Degrees of freedom, locations and scales have shape (..., D).
+    """
 
     @override
     def log_prob(self, value: Tensor) -> Tensor:
@@ -239,7 +279,7 @@ class StudentTDistribution(dist.StudentT):  # type: ignore[misc]
 
 
 class StudentTModule(ConditionalDistribution):
-    """Distribution module of `StudentT`."""
+    """Distribution module of `StudentT`; its parameters are location, scale and degrees of freedom, (..., D) each."""
 
     location_scale = True
     centred = True
@@ -263,7 +303,12 @@ class StudentTModule(ConditionalDistribution):
         return StudentTDistribution(df, loc, scale, validate_args=False)
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Return reparameterised values (..., D): normal noise divided by the square root of a gamma draw."""
+        """Return the reparameterised draw loc + scale * noise / sqrt(c / df), (..., D), with a chi-squared draw c.
+
+        Args:
+            parameters: location, scale and degrees of freedom, (..., D) each.
+            noise: standard normal noise (..., D).
+        """
         loc, scale, df = parameters
         gamma = torch._standard_gamma(0.5 * df)
         return loc + scale * noise * torch.rsqrt(2 * gamma / df)
@@ -271,20 +316,28 @@ class StudentTModule(ConditionalDistribution):
 
 @dataclass(frozen=True)
 class Delta:
-    """A point mass at the features, for a data variable that is a function of its parents.
+    """Point mass at the features, for a data variable that is a function of its parents.
 
-    It has no density, so there is no likelihood and no bound. Data enter such a model as history and through energies.
+    It has no density, so the model has no likelihood and no bound. The loss of such a model depends on the data only
+    through the past steps that the network reads, and through energies such as a squared error.
     """
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: the number of features is not D.
+        """
         if shape.features != shape.size:
-            raise ValueError(f"a Delta takes {shape.size} features, its size, but the network gives {shape.features}")
+            raise ValueError(
+                f"a Delta requires {shape.size} features, the value of {shape.name}, but the network returns "
+                f"{shape.features}; use a network with {shape.size} outputs"
+            )
         return DeltaModule()
 
 
 class DeltaModule(ConditionalDistribution):
-    """Distribution module of `Delta`."""
+    """Distribution module of `Delta`; its parameter is the value (..., D)."""
 
     deterministic = True
     location_scale = True
@@ -300,7 +353,7 @@ class DeltaModule(ConditionalDistribution):
 
     @override
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        """Return an empty placeholder, because no noise is needed."""
+        """Return an uninitialised tensor of the given shape, because a point mass needs no noise."""
         return like.new_empty(()).expand(*shape)
 
     @override
@@ -310,9 +363,9 @@ class DeltaModule(ConditionalDistribution):
 
 @dataclass(frozen=True)
 class Directions:
-    """A point mass at unit vectors of three coordinates each, such as directions in space.
+    """Point mass at unit vectors with three coordinates each, such as directions of bones.
 
-    Like `Delta`, it has no density.
+    The D coordinates of the variable are D / 3 vectors. Like `Delta`, the distribution has no density.
 
     Args:
         project: whether a linear layer maps features to vectors before normalisation; if False, the features are the
@@ -324,17 +377,21 @@ class Directions:
     residual: float = False
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: D is not divisible by 3, or the number of features is not D although `project` is False.
+        """
         if shape.size % 3 or not (self.project or shape.features == shape.size):
             raise ValueError(
-                f"Directions have three coordinates each and, without projection, are the features themselves; "
-                f"{shape.name} has {shape.size} coordinates and the network gives {shape.features} features"
+                "Directions require a size that is divisible by 3 and, with project=False, one feature per coordinate; "
+                f"{shape.name} has size {shape.size}, and the network returns {shape.features} features"
             )
         return DirectionsModule(self, shape)
 
 
 class DirectionsModule(DeltaModule):
-    """Distribution module of `Directions`."""
+    """Distribution module of `Directions`; its parameter is the unit vectors (..., D)."""
 
     location_scale = False
     centred = False
@@ -351,7 +408,7 @@ class DirectionsModule(DeltaModule):
 
 @dataclass(frozen=True)
 class StandardNormal:
-    """N(0, I) for any features: the default distribution of a model variable without parents."""
+    """The fixed distribution N(0, I), which ignores features; the default for a model variable without parents."""
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape."""
@@ -359,7 +416,11 @@ class StandardNormal:
 
 
 class StandardNormalModule(Gaussian):
-    """Distribution module of `StandardNormal`."""
+    """Distribution module of `StandardNormal`.
+
+    Args:
+        size: D, dimension of the variable.
+    """
 
     zero: Tensor
 

@@ -1,7 +1,8 @@
-"""Family: any Pyro distribution as a conditional distribution, and named families for observations.
+"""Use any Pyro distribution as a conditional distribution, and define named families for observations.
 
-A distribution declares the constraints of its parameters (`arg_constraints`). `biject_to` maps the output of a linear
-layer to them: a rate is the exponential of the output, and a scale matrix has a positive diagonal.
+A distribution declares the constraints of its parameters (`arg_constraints`). `biject_to` of torch maps the output of a
+linear layer to values that satisfy them. For example, a rate is the exponential of the output, and a scale matrix has a
+positive diagonal.
 
 | family | observations | distribution |
 |---|---|---|
@@ -17,11 +18,11 @@ layer to them: a rate is the exponential of the output, and a scale matrix has a
 | binary | 0 or 1 | Bernoulli |
 | category | one of D classes, one-hot encoded in D coordinates | OneHotCategorical |
 | count, overdispersed | non-negative integers; those with a larger variance than Poisson | Poisson, negative binomial |
-| sparse, sparse-overdispersed | the same with excess zeros | zero-inflated Poisson, negative binomial |
+| sparse, sparse-overdispersed | like the previous two, with excess zeros | zero-inflated Poisson, negative binomial |
 
-For a power spectrum, the negative log density equals the Itakura-Saito divergence from the mean, up to terms of the
-data alone. It is the likelihood of complex normals whose variance is that mean (Févotte, Bertin and Durrieu, 2009). The
-speech models in the review of Girin et al. (2021, arXiv 2008.12595) use it.
+For a power spectrum, the negative log density equals the Itakura-Saito divergence from the mean, up to terms that
+depend only on the data. It is the likelihood of complex normals whose variance is that mean (Févotte, Bertin and
+Durrieu, 2009). The speech models in the review of Girin et al. (2021, arXiv 2008.12595) use it.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from .families import FixedNormal, Normal, StudentT
 from .precise import BoundedDistribution, DoublePrecision
 
 ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
-"""Equivalent parameters; the network provides the first of each group."""
+"""Groups of equivalent parameters; of each group, a distribution uses only the first that it has."""
 
 Affine = Callable[[Tensor, Tensor, Tensor], Tensor]  # (parameter, mean, scale) -> parameter of mean + scale * variable
 
@@ -92,25 +93,25 @@ UNITS: Mapping[str, Mapping[str, Affine]] = {
     )
     for name in names.split()
 }
-"""Conversion of the parameters to another unit of the variable, by distribution.
+"""Functions that convert parameters to another unit of the variable, by distribution and parameter.
 
-A rate of counts becomes the rate of counts with a mean multiplied by the scale. Distributions with a scale but no
-location ignore the mean.
+The conversion multiplies the mean of a count distribution by the scale. Distributions without a location ignore the
+mean of the unit.
 """
 
 
 class Interior(constraints.Constraint):
-    """The interior of the unit interval or of the simplex.
+    """Constraint to the interior of the unit interval or of the simplex.
 
     Args:
-        closed: the closed constraint, which includes the boundary.
+        closed: torch's constraint to the same set with its boundary.
     """
 
     def __init__(self, closed: Any):
         self.closed, self.event_dim = closed, closed.event_dim
 
     def check(self, value: Tensor) -> Tensor:
-        """Return whether values are in the interior."""
+        """Return whether each value (unit interval) or vector (simplex) is in the interior."""
         inside = self.closed.check(value)
         return inside & (value > 0).all(-1) if self.event_dim else inside & (value > 0) & (value < 1)
 
@@ -122,7 +123,10 @@ transform_to.register(Interior, lambda constraint: transform_to(constraint.close
 
 
 class VonMises(dist.VonMises):  # type: ignore[misc]
-    """A von Mises distribution for any concentration; torch's gradients in float32 require one between 3e-6 and 4e4."""
+    """Von Mises distribution for any concentration.
+
+    In float32, the gradients of torch's distribution require a concentration between 3e-6 and 4e4.
+    """
 
     @override
     def log_prob(self, value: Tensor) -> Tensor:
@@ -132,7 +136,10 @@ class VonMises(dist.VonMises):  # type: ignore[misc]
 
     @override
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Return draws; the concentration is clamped because rejection sampling does not terminate near 1e16."""
+        """Return draws (*sample_shape, ...).
+
+        The concentration is limited to 1e12, because torch's rejection sampling does not terminate near 1e16.
+        """
         narrow = dist.VonMises(self.loc, self.concentration.clamp(max=1e12), validate_args=False)
         return narrow.sample(torch.Size(sample_shape))  # type: ignore[no-any-return]
 
@@ -142,31 +149,40 @@ OPEN: Mapping[type[Distribution], Any] = {
     **dict.fromkeys((plain.Beta, plain.Kumaraswamy, plain.RelaxedBernoulli), Interior(constraints.unit_interval)),
     **dict.fromkeys((plain.Dirichlet, plain.RelaxedOneHotCategorical), Interior(constraints.simplex)),
 }
-"""Open supports of distributions that torch declares closed although their density at the boundary is 0 or infinite."""
+"""Supports without boundary, for distributions whose density at the boundary is 0 or infinite.
+
+Torch declares these supports with their boundary.
+"""
 
 PLAIN = {"Bernoulli", "Categorical", "Cauchy", "Delta", "Exponential", "HalfCauchy", "HalfNormal", "Laplace"}
 PLAIN |= {"LogNormal", "Normal", "OneHotCategorical", "Uniform", "VonMises"}
-"""Distributions whose log density has no cancelling large terms. All others are evaluated in float64."""
+"""Names of the distributions whose log density is accurate in float32, because no large terms cancel.
+
+The log densities of all other distributions are computed in float64.
+"""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Any distribution of `pyro.distributions`, with parameters that are functions of the features or learned.
+    """Any distribution of `pyro.distributions`, with parameters that are fixed, learned or functions of the features.
 
-    For equivalent parameters such as probs and logits, the network provides the first of `ALTERNATIVES`. Integer
-    parameters such as a total count must be given.
+    Each parameter that is neither in `given` nor in `learned` is a function of the features. Of equivalent parameters,
+    such as logits and probs, only the first in `ALTERNATIVES` is used. Integer parameters, such as a total count, must
+    be given.
 
     Args:
-        distribution: name, such as "Poisson", or a class; a run directory cannot store a class.
-        given: fixed parameters, such as {"total_count": 12}.
+        distribution: name of a class in `pyro.distributions`, such as "Poisson", or a distribution class. A model with
+            a class cannot be stored in a run directory.
+        given: values of fixed parameters by name, such as {"total_count": 12}.
         learned: names of parameters that are learned and do not depend on the features.
-        shapes: shapes of the parameters of a vector distribution if they are not D or (D, D), with -1 for D, such as
-            {"cov_factor": (-1, 2)}.
-        min_scale: lower bound of scales and of square roots of diagonals; without one, the likelihood may be unbounded.
+        shapes: shapes of parameters by name, for parameters of a vector distribution whose shape is not (D,) or (D, D);
+            -1 stands for D, such as {"cov_factor": (-1, 2)}.
+        min_scale: lower bound of `scale` and of the square root of `cov_diag`. With a bound of 0, the likelihood may be
+            unbounded.
         residual: share of the previous value, as in `ConditionalDistribution`; requires a location.
-        project: whether a linear layer maps features to parameters; if False, the features are the parameters in their
-            order, with the location first.
-        error_weight: whether the scale is the weight of a squared error, as in `ConditionalDistribution`.
+        project: whether a linear layer maps features to parameters. If False, the features are the parameters before
+            they are mapped to their constraints: the location first, the others in the distribution's order.
+        error_weight: whether the scale only weights a squared error, as in `ConditionalDistribution`.
 
     Example:
         >>> pair, sizes = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"), {"z": 2, "x": 3}
@@ -186,7 +202,7 @@ class Family:
 
     @property
     def kind(self) -> type[Distribution]:
-        """The distribution class.
+        """Class of the distribution.
 
         Raises:
             ValueError: Pyro has no distribution with this name.
@@ -200,12 +216,18 @@ class Family:
         raise ValueError(f"Pyro has no distribution {self.distribution!r}{nearest(self.distribution, names)}")
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: Pyro has no such distribution, it does not declare constraints of its parameters, a parameter is
+                unknown or must be given, all parameters are given, or the distribution does not fit `residual` or the
+                number of features.
+        """
         return FamilyModule(self, shape)
 
 
 class FamilyModule(ConditionalDistribution):
-    """Distribution module of `Family`; its parameters are the distribution's, each flattened to (..., P)."""
+    """Distribution module of `Family`; its parameters are those of the distribution, each flattened to (..., P)."""
 
     def __init__(self, spec: Family, shape: Shape):
         super().__init__(spec.residual)
@@ -220,7 +242,9 @@ class FamilyModule(ConditionalDistribution):
         self.location_scale = bool(self.moves.keys() & self.forms.keys())
         self.centred = "loc" in self.forms and self.moves.get("loc") is _location
         if self.residual and "loc" not in self.forms:
-            raise ValueError(f"{self.kind.__name__} has no location, so a previous value cannot be added")
+            raise ValueError(
+                f"{self.kind.__name__} has no location to which a previous value could be added; use residual=0"
+            )
         widths = {name: math.prod(free) for name, (free, _, _) in self.forms.items()}
         names = [name for name in widths if name not in spec.learned]
         self.read = sorted(names, key=lambda name: name != "loc")  # `projection` expects the location first
@@ -231,8 +255,9 @@ class FamilyModule(ConditionalDistribution):
             self.out = self.projection(shape.features, sum(self.widths), widths.get("loc", 0)) if self.read else None
         elif shape.features != sum(self.widths):
             raise ValueError(
-                f"a {self.kind.__name__} without projection takes {sum(self.widths)} features, as many as the "
-                f"parameters that are read ({', '.join(self.read) or 'none'}), but the network gives {shape.features}"
+                f"a {self.kind.__name__} with project=False requires {sum(self.widths)} features for its parameters "
+                f"({', '.join(self.read) or 'none'}), but the network returns {shape.features}; use a network with "
+                f"{sum(self.widths)} outputs, or project=True"
             )
         with torch.no_grad():
             probe = torch.ones(1, shape.features), torch.zeros(1, shape.size) if self.residual else None
@@ -292,7 +317,10 @@ class FamilyModule(ConditionalDistribution):
     @override
     def mean(self, parameters: Parameters) -> Tensor:
         if not self.centre:
-            raise ValueError(f"{self.kind.__name__} has no mean to replace entries that are missing or not drawn")
+            raise ValueError(
+                f"{self.kind.__name__} has neither a mean nor a mode, but missing data and forecasts without draws "
+                "require one; choose another distribution, or use complete data and drawn forecasts"
+            )
         return getattr(self.distribution(parameters), self.centre)  # type: ignore[no-any-return]
 
     @override
@@ -302,26 +330,30 @@ class FamilyModule(ConditionalDistribution):
 
 
 def _is_fixed(support: Any) -> bool:
-    """Return whether a support is independent of the parameters."""
+    """Return whether a support does not depend on the parameters."""
     if hasattr(support, "base_constraint"):
         return _is_fixed(support.base_constraint)
     return not any(isinstance(value, Tensor) for value in vars(support).values())
 
 
 Form = tuple[tuple[int, ...], Any, tuple[int, ...]]
-"""The unconstrained shape of a parameter, the map to its constraint, and the constrained shape."""
+"""Triple of a parameter: its unconstrained shape, the map to its constraint, and its constrained shape."""
 
 
 def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
-    """Return the form of every parameter that is not given.
+    """Return the `Form` of every parameter that is read or learned, by name.
 
     Raises:
-        ValueError: the distribution does not declare its parameters, a name is unknown, or an integer is not given.
+        ValueError: the distribution does not declare constraints of its parameters, the name of a parameter is unknown,
+            an integer parameter is not given, or all parameters are given.
     """
     kind, name = spec.kind, spec.kind.__name__
     constraints = kind.arg_constraints
     if not isinstance(constraints, Mapping):
-        raise ValueError(f"{name} does not declare constraints of its parameters; write a custom distribution")
+        raise ValueError(
+            f"{name} does not declare constraints of its parameters (`arg_constraints`), which a Family requires; "
+            "write a ConditionalDistribution for it"
+        )
     parameters = inspect.signature(kind.__init__).parameters
     if unknown := [key for key in (*spec.given, *spec.learned, *spec.shapes) if key not in parameters]:
         raise ValueError(
@@ -339,7 +371,7 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
             is_integer = constraint.is_discrete
         if is_integer:
             raise ValueError(
-                f"{key} of {name} is a whole number, which no network outputs; set it with given={{{key!r}: 10}}"
+                f"the parameter {key} of {name} is a whole number and must be given, such as given={{{key!r}: 10}}"
             )
         if key in spec.shapes:
             size: tuple[int, ...] = tuple(shape.size if n == -1 else n for n in spec.shapes[key])
@@ -348,19 +380,27 @@ def _forms(spec: Family, shape: Shape) -> dict[str, Form]:
         to = _transform(constraint)
         forms[key] = tuple(to.inverse_shape(torch.Size(size))), to, size
     if not forms:
-        raise ValueError(f"no parameter of {name} is left to be read or learned; it has {', '.join(constraints)}")
+        raise ValueError(
+            f"all parameters of {name} are given, so no parameter is left to be read or learned; remove one of "
+            f"{', '.join(constraints)} from `given`"
+        )
     return forms
 
 
 @contextmanager
 def _explain_errors(spec: Family, *errors: type[Exception]) -> Iterator[None]:
-    """Convert errors of constructing a distribution into a ValueError with an explanation."""
+    """Convert errors that occur while a distribution is built into a ValueError with an explanation.
+
+    Args:
+        spec: specification of the distribution, named in the message.
+        errors: types of the errors to convert.
+    """
     try:
         yield
     except errors as error:
         raise ValueError(
             f"{spec.kind.__name__} with given={dict(spec.given)} cannot be built from the output of a network "
-            f"({error}); give the values that it needs, or write a custom distribution"
+            f"({error}); give further parameters in `given`, or write a ConditionalDistribution for it"
         ) from error
 
 
@@ -372,7 +412,7 @@ def _transform(constraint: Any) -> Any:
 
 
 def _centre(distribution: Any) -> str:
-    """Return "mean", or "mode" if the mean is not finite (Cauchy), or "" if neither exists."""
+    """Return "mean" if the distribution has a finite mean, otherwise "mode", or "" if it has no finite mode either."""
     for name in ("mean", "mode"):
         with suppress(NotImplementedError, AttributeError):
             if torch.isfinite(getattr(distribution, name)).all():
@@ -382,10 +422,10 @@ def _centre(distribution: Any) -> str:
 
 @dataclass(frozen=True)
 class NormalMixture:
-    """A separate mixture of normals for each coordinate, with weights, locations and scales from the features.
+    """Separate mixture of normals for each coordinate; weights, locations and scales are functions of the features.
 
     Args:
-        components: K, number of components.
+        components: K, number of components of each mixture, at least 1.
         min_scale: lower bound of the scales.
     """
 
@@ -393,9 +433,13 @@ class NormalMixture:
     min_scale: float = 1e-3
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: `components` is less than 1.
+        """
         if self.components < 1:
-            raise ValueError(f"a mixture needs at least one component, got {self.components}")
+            raise ValueError(f"`components` of NormalMixture must be at least 1, got {self.components}")
         return NormalMixtureModule(self, shape)
 
 
@@ -438,10 +482,12 @@ class NormalMixtureModule(ConditionalDistribution):
 
 @dataclass(frozen=True)
 class LowRankNormal:
-    """A multivariate normal for each step, with covariance of low rank plus a diagonal.
+    """Multivariate normal for each step, with the covariance L L' + diagonal; L has shape (D, rank).
+
+    Location, L and diagonal are functions of the features.
 
     Args:
-        rank: number of factors of the covariance.
+        rank: number of columns of L.
         min_scale: lower bound of the square roots of the diagonal.
         residual: share of the previous value, as in `ConditionalDistribution`.
     """
@@ -477,4 +523,4 @@ FAMILIES: Mapping[str, DistributionSpec] = {
     "sparse": Family("ZeroInflatedPoisson"),
     "sparse-overdispersed": Family("ZeroInflatedNegativeBinomial"),
 }
-"""Families for observations, by name."""
+"""Specifications of the families for observations by name, as described in the table of this module."""

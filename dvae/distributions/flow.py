@@ -1,4 +1,4 @@
-"""The QR flow: layers of an orthogonal and a triangular matrix with leaky rectifiers between them.
+"""The QR flow: each layer is an orthogonal times a triangular matrix, with leaky rectifiers between layers.
 
     z^l = Q^l R^l x^l + b^l,        x^{l+1} = PReLU(z^l) for all layers but the last,        z^L ~ N(0, I)
 
@@ -31,13 +31,13 @@ from .priors import Prior
 class QRFlow:
     """Normalizing flow for a static latent without parents: a bijection of R^D with a closed-form determinant.
 
-    The diagonal of R is the exponential of the diagonal of `triangular`; the part below the diagonal is unused. There
-    are two differences from the paper. A PReLU is parameterised by the logarithm of its slope, so the slope stays
-    positive. The first layer reads W (x - m), where the location m and the whitening W are buffers, not parameters.
-    They are 0 and the identity unless `whiten` estimates them from data.
+    The diagonal of R is the exponential of the diagonal of the module's parameter `triangular`, whose part below the
+    diagonal is unused. There are two differences from the paper. A PReLU is parameterised by the logarithm of its
+    slope, so the slope stays positive. The first layer reads W (x - m), where the location m and the whitening W are
+    buffers, not parameters. They are 0 and the identity unless `whiten` estimates them from data.
 
     Args:
-        layers: L, number of layers.
+        layers: L, number of layers, at least 1.
     """
 
     layers: int = 3
@@ -46,7 +46,8 @@ class QRFlow:
         """Return the module for a static latent without parents.
 
         Raises:
-            ValueError: the size or the number of layers is less than 1.
+            ValueError: the variable is not a static latent without parents, or its size or the number of layers is less
+                than 1.
         """
         return QRFlowModule(self, shape)
 
@@ -58,7 +59,9 @@ class QRFlowModule(Prior):
         super().__init__(spec, shape)
         size, layers = shape.size, spec.layers
         if size < 1 or layers < 1:
-            raise ValueError(f"a QRFlow has size {size} and {layers} layers; both must be at least 1")
+            raise ValueError(
+                f"a QRFlow requires a size and a number of layers of at least 1, got size {size} and {layers} layers"
+            )
         self.size = size
         bound = size**-0.5
         self.triangular = nn.Parameter(torch.empty(layers, size, size).uniform_(-bound, bound))
@@ -71,14 +74,17 @@ class QRFlowModule(Prior):
         self.register_buffer("whitening", torch.eye(size))
 
     def factors(self) -> tuple[Tensor, Tensor]:
-        """Return Q and R of every layer, (L, D, D) each.
+        """Return the matrices Q and R of all layers, (L, D, D) each.
 
         Raises:
-            ValueError: the parameters have half precision, which triangular solves do not support.
+            ValueError: the weights have half precision, which triangular solves do not support.
         """
         v = self.reflections
         if torch.finfo(v.dtype).bits < 32:
-            raise ValueError(f"a QRFlow has no half precision, but its parameters are {v.dtype}; use mixed precision")
+            raise ValueError(
+                f"a QRFlow does not support half precision, but its weights are {v.dtype}; keep float32 weights and "
+                "fit with precision='bf16-mixed' or '32-true'"
+            )
         gram = v @ v.mT
         s = gram.triu(1) + torch.diag_embed(gram.diagonal(dim1=1, dim2=2) / 2)
         identity = torch.eye(self.size, dtype=v.dtype, device=v.device)
@@ -91,16 +97,17 @@ class QRFlowModule(Prior):
         return FlowDistribution(self, self.bias[0])
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map a value to noise.
+        """Map values to noise.
 
         Args:
             x: values (..., D).
 
         Returns:
-            z (..., D), standard normal if x follows this distribution, and log |det dz/dx| (...).
+            z: noise (..., D), which is standard normal if x follows this distribution.
+            log_det: log |det dz/dx|, (...).
 
         Raises:
-            ValueError: x has another size.
+            ValueError: the last dimension of x is not D, or the weights have half precision.
         """
         self._check(x)
         with torch.autocast(x.device.type, enabled=False):
@@ -121,7 +128,11 @@ class QRFlowModule(Prior):
         return z, log_det
 
     def from_noise(self, z: Tensor) -> Tensor:
-        """Map noise z (..., D) to values x (..., D), the inverse of `to_noise`."""
+        """Map noise z (..., D) to values x (..., D), the inverse of `to_noise`.
+
+        Raises:
+            ValueError: the last dimension of z is not D, or the weights have half precision.
+        """
         self._check(z)
         with torch.autocast(z.device.type, enabled=False):
             q, r = self.factors()
@@ -138,20 +149,20 @@ class QRFlowModule(Prior):
     def whiten(self, values: Tensor) -> None:
         """Set location and whitening so that these values enter the first layer with mean 0 and unit covariance.
 
-        The family of distributions stays the same, but the parameters then learn about directions of low variance as
-        fast as about others. Variances are increased by 1e-9 of the mean variance, which regularises directions of
-        almost no variance.
+        The flow can represent the same distributions as before, but its training fits directions of low variance as
+        fast as other directions. To regularise directions with almost no variance, 1e-9 of the mean variance is added
+        to all variances.
 
         Args:
-            values: (..., D), more than D values.
+            values: values (..., D) of the variable, more than D in total.
 
         Raises:
-            ValueError: the values have another size, or there are too few.
+            ValueError: the last dimension of the values is not D, or there are at most D values.
         """
         self._check(values)
         values = values.detach().reshape(-1, self.size).double()
         if len(values) <= self.size:
-            raise ValueError(f"whitening {self.size} dimensions needs more than {self.size} values, got {len(values)}")
+            raise ValueError(f"whitening requires more values than dimensions ({self.size}), got {len(values)} values")
         covariance = values.T.cov().reshape(self.size, self.size)
         identity = torch.eye(self.size, dtype=values.dtype, device=values.device)
         least = 1e-9 * covariance.diagonal().mean().clamp(min=torch.finfo(torch.float32).tiny)
@@ -161,28 +172,32 @@ class QRFlowModule(Prior):
 
     def _check(self, value: Tensor) -> None:
         if value.shape[-1:] != (self.size,):
-            raise ValueError(f"a QRFlow of size {self.size} takes (..., {self.size}), got {tuple(value.shape)}")
+            raise ValueError(
+                f"a QRFlow of size {self.size} takes the shape (..., {self.size}), got {tuple(value.shape)}"
+            )
 
 
 class Bijection(Protocol):
-    """A bijection of R^D between values and noise."""
+    """Interface of a bijection of R^D between values and noise."""
 
     def to_noise(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map values (..., D) to noise (..., D) and the log |det| (...) of the Jacobian."""
+        """Map values x (..., D) to noise z (..., D) and log |det dz/dx| (...)."""
         ...
 
     def from_noise(self, z: Tensor) -> Tensor:
-        """Map noise (..., D) to values (..., D)."""
+        """Map noise (..., D) to values (..., D), the inverse of `to_noise`."""
         ...
 
 
 class FlowDistribution(TorchDistribution):
-    """Distribution of standard normal noise under a bijection, with exact log density and exact draws.
+    """Distribution of values that a bijection maps to standard normal noise: event shape (D,).
+
+    Log densities and draws are exact.
 
     Args:
         flow: bijection between values and noise.
-        like: a tensor (..., D) that defines size, dtype and device.
-        batch_shape: batch shape of independent values.
+        like: tensor (..., D) that defines D, dtype and device.
+        batch_shape: batch shape of the distribution; values are independent.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -194,12 +209,12 @@ class FlowDistribution(TorchDistribution):
         super().__init__(torch.Size(batch_shape), like.shape[-1:], validate_args=False)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """Return draws (*sample_shape, *batch_shape, D)."""
+        """Return reparameterised draws (*sample_shape, *batch_shape, D)."""
         shape = self._extended_shape(torch.Size(sample_shape))
         return self.flow.from_noise(torch.randn(shape, dtype=self.like.dtype, device=self.like.device))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return log p (...) of values (..., D), in nats."""
+        """Return the log densities (...) of values (..., D), in nats."""
         noise, log_det = self.flow.to_noise(value)
         density = log_det - noise.square().sum(-1) / 2 - self.event_shape[0] / 2 * math.log(2 * math.pi)
         return density.expand(torch.broadcast_shapes(density.shape, self.batch_shape))

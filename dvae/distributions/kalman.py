@@ -15,8 +15,9 @@ linear with known matrices. They need three products per step; everything else i
 smoother and the draws, which start at the last step, are also linear recursions. Long series run in blocks (`scan.py`).
 
 Precise observations cause cancellation: W_t P_t g_t multiplies a small matrix by a large vector. All computations
-therefore use float64, and the m_t are refined once: single filter steps give the local errors, and F propagates them.
-The means are then exact to a thousandth of their standard deviations if variance times information is at most 1e10.
+therefore use float64, and the m_t are corrected once: a filter step from each m_t gives the error of m_{t+1}, and the
+recursion with F_t accumulates these errors. The means are then exact to a thousandth of their standard deviations if
+variance times information is at most 1e10.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from .scan import Covariances, Recursion, States, backward, from_last, riccati, 
 
 
 class Moments(NamedTuple):
-    """Means (T, B, N) and covariances (T, B, N, N) of every z_t."""
+    """Means (T, B, N) and covariances (T, B, N, N) of z_1 to z_T, in float64."""
 
     mean: Tensor
     covariance: Tensor
@@ -41,17 +42,19 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True)
 class LinearGaussianChain:
-    """A linear-Gaussian chain and its weights, in the notation of this module, with time as the first dimension.
+    """A linear-Gaussian chain z_1 to z_T with weights, in the notation of this module.
 
-    Gradients flow through all results, which are in float64.
+    A weight is the likelihood of the observation at step t as a function of z_t. Time is the first dimension of all
+    tensors. All results are in float64 and differentiable with respect to all arguments.
 
     Args:
-        transition: A_2 to A_T, (T - 1, B, N, N).
-        offset: b_2 to b_T, (T - 1, B, N).
-        noise: Q, (N, N), or Q_2 to Q_T, (T - 1, B, N, N).
-        mean, covariance: m_1 (B, N) and P_1 (B, N, N).
-        information: G, (T, B, N, N), symmetric.
-        potential: g, (T, B, N).
+        transition: matrices A_2 to A_T, (T - 1, B, N, N).
+        offset: offsets b_2 to b_T, (T - 1, B, N).
+        noise: covariance Q of the noise, (N, N), or Q_2 to Q_T, (T - 1, B, N, N).
+        mean: mean m_1 of z_1, (B, N).
+        covariance: covariance P_1 of z_1, (B, N, N).
+        information: quadratic terms G_1 to G_T of the log weights, (T, B, N, N), symmetric.
+        potential: linear terms g_1 to g_T of the log weights, (T, B, N).
     """
 
     transition: Tensor
@@ -68,7 +71,7 @@ class LinearGaussianChain:
 
     @cached_property
     def predicted(self) -> Moments:
-        """Moments of z_t given the weights before t."""
+        """Moments of each z_t given the weights at steps before t."""
         return Moments(
             *Predict.apply(
                 self.transition,
@@ -83,17 +86,20 @@ class LinearGaussianChain:
 
     @cached_property
     def filtered(self) -> Moments:
-        """Moments of z_t given the weights up to t."""
+        """Moments of each z_t given the weights at steps up to t."""
         return update(*self.predicted, self.information, self.potential)
 
     @cached_property
     def _gain(self) -> Tensor:
-        """Coefficient (T - 1, B, N, N) of z_{t+1} in E(z_t | z_{t+1}, weights up to t)."""
+        """Matrices (T - 1, B, N, N) that multiply z_{t+1} in E(z_t | z_{t+1}, weights up to t), for t = 1 to T - 1."""
         return torch.linalg.solve(self.predicted.covariance[1:], self.transition @ self.filtered.covariance[:-1]).mT
 
     @cached_property
     def _backward(self) -> tuple[Tensor, Moments]:
-        """Gain, and moments at z_{t+1} = 0, of z_t given z_{t+1} and the weights up to t, in reverse order of t."""
+        """The distribution of z_t given z_{t+1} and the weights up to t, for t = T - 1 to 1.
+
+        It consists of the gain, which multiplies z_{t+1}, and the moments of z_t at z_{t+1} = 0.
+        """
         gain = self._gain
         remainder = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain @ self.transition
         # Joseph's form is a sum of squares, so rounding cannot make it negative, unlike the difference
@@ -103,7 +109,7 @@ class LinearGaussianChain:
 
     @cached_property
     def smoothed(self) -> Moments:
-        """Moments of z_t given all weights."""
+        """Moments of each z_t given all weights."""
         gain, (mean, covariance) = self._backward
         means = States.apply(gain, mean, self.filtered.mean[-1])
         covariances = Covariances.apply(gain, covariance, self.filtered.covariance[-1])
@@ -111,11 +117,15 @@ class LinearGaussianChain:
 
     @property
     def lag_one(self) -> Tensor:
-        """Cov(z_{t+1}, z_t) given all weights, (T - 1, B, N, N)."""
+        """Covariances Cov(z_{t+1}, z_t) given all weights, (T - 1, B, N, N), for t = 1 to T - 1."""
         return self.smoothed.covariance[1:] @ self._gain.mT
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Return reparameterised draws (T, B, N) of z_{1:T} given all weights, from standard normal noise (T, B, N)."""
+        """Return reparameterised draws (T, B, N) of z_{1:T} given all weights.
+
+        Args:
+            noise: standard normal noise (T, B, N).
+        """
         gain, (mean, covariance) = self._backward
         roots = torch.linalg.cholesky(torch.cat([self.filtered.covariance[-1:], covariance]))
         values = torch.cat([self.filtered.mean[-1:], mean]) + _times(roots, noise.flip(0).double())
@@ -123,7 +133,14 @@ class LinearGaussianChain:
 
 
 def update(mean: Tensor, covariance: Tensor, information: Tensor, potential: Tensor) -> Moments:
-    """Return the moments of N(mean, covariance) times exp(g' z - z' G z / 2); shapes (..., N) and (..., N, N)."""
+    """Return the moments of the normal distribution proportional to N(z; mean, covariance) exp(g' z - z' G z / 2).
+
+    Args:
+        mean: (..., N).
+        covariance: (..., N, N).
+        information: G, (..., N, N), symmetric.
+        potential: g, (..., N).
+    """
     identity = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
     shift = _column(covariance, potential - _times(information, mean))
     # more exact than updated covariance times difference if the difference is large
@@ -133,7 +150,10 @@ def update(mean: Tensor, covariance: Tensor, information: Tensor, potential: Ten
 
 
 class Predict(torch.autograd.Function):
-    """The prediction m (T, B, N) and P (T, B, N, N) as a function of the arguments of `LinearGaussianChain`."""
+    """Autograd function from the arguments of `LinearGaussianChain` to the predicted m (T, B, N) and P (T, B, N, N).
+
+    The noise has the shape (T - 1, B, N, N).
+    """
 
     @staticmethod
     def forward(
@@ -146,7 +166,7 @@ class Predict(torch.autograd.Function):
         information: Tensor,
         potential: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Run the filter."""
+        """Return the predicted means m and covariances P, computed by a filter."""
         covariances, shrink, carry = riccati(transition, noise, information[:-1], covariance)
         covariances = symmetric(covariances)
         filtered = shrink @ covariances[:-1]
@@ -162,9 +182,9 @@ class Predict(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_mean: Tensor, to_covariance: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradients of the arguments from the gradients of means and covariances.
+        """Return the gradients of all arguments, given the gradients of the means and covariances.
 
-        The gradient for G is not symmetric; its symmetric part is the gradient, since G is symmetric.
+        The matrix that is returned for G is not symmetric. Since G is symmetric, only its symmetric part matters.
         """
         transition, information, potential, means, filtered, shrink, carry = ctx.saved_tensors
         back = backward(carry)

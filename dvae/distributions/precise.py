@@ -1,4 +1,4 @@
-"""Distributions whose values or densities need more precision than the float32 of the networks.
+"""Distributions whose values or densities require more precision than the float32 of the networks.
 
 `OffsetDistribution` subtracts the mean in float64, because float32 cannot represent the noise in 1e9 + N(0, 1).
 `DoublePrecision` evaluates a density in float64 if its terms cancel: a Poisson log density at mean 1e7 is a difference
@@ -19,7 +19,11 @@ from typing_extensions import override
 
 
 class _Wrapped(TorchDistribution):
-    """A distribution with the shapes and the support of its base distribution."""
+    """Base class of distributions with the shapes, moments and support of another distribution.
+
+    Args:
+        base: the other distribution.
+    """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
@@ -29,11 +33,11 @@ class _Wrapped(TorchDistribution):
         super().__init__(base.batch_shape, base.event_shape, validate_args=False)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """Return a reparameterised draw."""
+        """Return reparameterised draws of the base distribution, (*sample_shape, *batch_shape, *event_shape)."""
         return self.base.rsample(torch.Size(sample_shape))  # type: ignore[no-any-return]
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Return a draw."""
+        """Return draws of the base distribution, (*sample_shape, *batch_shape, *event_shape)."""
         return self.base.sample(torch.Size(sample_shape))  # type: ignore[no-any-return]
 
     @property
@@ -53,11 +57,11 @@ class _Wrapped(TorchDistribution):
 
 
 class OffsetDistribution(_Wrapped):
-    """The distribution of offset + value, in float64.
+    """Distribution of offset + u, where u follows the base distribution; its values are in float64.
 
     Args:
-        base: distribution of the value.
-        offset: (D,) float64.
+        base: distribution of u, with values (..., D).
+        offset: offset (D,) in float64.
         dtype: dtype of the parameters of the base distribution.
     """
 
@@ -66,7 +70,7 @@ class OffsetDistribution(_Wrapped):
         self.offset, self.dtype = offset, dtype
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density in the precision of the base distribution."""
+        """Return the log density in nats, in the precision of the base distribution, of values in float64."""
         return self.base.log_prob((value - self.offset).to(self.dtype))  # type: ignore[no-any-return]
 
     @override
@@ -88,14 +92,16 @@ class OffsetDistribution(_Wrapped):
 
 
 class BoundedDistribution(_Wrapped):
-    """A distribution with density 0 outside a parameter-dependent support, which torch may not enforce.
+    """Distribution with density 0 outside its support, for a support that depends on parameters.
+
+    Torch may return a positive density outside such a support.
 
     Args:
-        base: the distribution.
+        base: distribution whose support is enforced.
     """
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density or log probability."""
+        """Return the log density or log probability in nats."""
         inside = self.support.check(value)  # type: ignore[no-untyped-call]
         return torch.where(inside, self.base.log_prob(value), -torch.inf)
 
@@ -105,11 +111,11 @@ class BoundedDistribution(_Wrapped):
 
 
 class DoublePrecision(_Wrapped):
-    """A distribution whose log density is evaluated in float64 and returned in the precision of the value.
+    """Distribution whose log density is computed in float64 and returned in the precision of the value.
 
     Args:
-        base: the distribution.
-        double: function that returns the same distribution with parameters in float64.
+        base: distribution that provides draws, moments and support.
+        double: function that returns the base distribution with parameters in float64.
     """
 
     def __init__(self, base: Any, double: Callable[[], Any]):
@@ -117,7 +123,7 @@ class DoublePrecision(_Wrapped):
         self.double = double
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density or log probability."""
+        """Return the log density or log probability in nats."""
         return self.double().log_prob(value.double()).to(value.dtype)  # type: ignore[no-any-return]
 
     def expand(self, batch_shape: Any, _instance: object = None) -> DoublePrecision:

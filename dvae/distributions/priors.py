@@ -19,13 +19,13 @@ from .base import ConditionalDistribution, Parameters, Shape
 
 
 class Prior(ConditionalDistribution):
-    """A distribution of (D,) without features, the same for every sequence; subclasses implement `prior`.
+    """Base class of modules for the distribution of a static latent without parents, the same for every sequence.
 
-    All coordinates are one event.
+    All D coordinates are one event. Subclasses implement `prior`.
 
     Args:
-        spec: specification of the prior.
-        shape: shape of the variable.
+        spec: specification of the prior, named in errors.
+        shape: the variable.
 
     Raises:
         ValueError: the variable is not a static latent without parents.
@@ -40,15 +40,15 @@ class Prior(ConditionalDistribution):
         if wrong:
             raise ValueError(
                 f"{spec} is a distribution of static latents without parents, such as w in p(w), but {shape.name} "
-                + " and ".join(wrong)
+                f"{' and '.join(wrong)}; give {shape.name} another distribution"
             )
 
     def prior(self) -> Any:
-        """Return the distribution: no batch, event (D,)."""
+        """Return the Pyro distribution: batch shape (), event shape (D,)."""
         raise NotImplementedError
 
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
-        """Return the features, whose batch shape is the number of sequences."""
+        """Return the features (B, 0) as the only parameter; `distribution` reads the number of sequences B from it."""
         return (features,)
 
     @override
@@ -58,7 +58,7 @@ class Prior(ConditionalDistribution):
 
 @dataclass(frozen=True)
 class Mixture:
-    """A mixture of diagonal normals with learned weights, locations and scales.
+    """Mixture of diagonal normals with learned weights, locations and scales, for a static latent without parents.
 
     Args:
         components: number of normals.
@@ -67,7 +67,11 @@ class Mixture:
     components: int = 8
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a static latent without parents."""
+        """Return the module for a static latent without parents.
+
+        Raises:
+            ValueError: the variable is not a static latent without parents.
+        """
         return MixtureModule(self, shape)
 
 
@@ -91,20 +95,26 @@ class MixtureModule(Prior):
 
 @dataclass(frozen=True)
 class Vamp:
-    """The variational mixture of posteriors, p(w) = 1/K sum_k q(w | u_k), with learned pseudo-sequences u_k.
+    """Variational mixture of posteriors, p(w) = 1/K sum_k q(w | u_k), with learned pseudo-sequences u_k.
 
-    Source: Tomczak and Welling, 2018, arXiv 1705.07120. It uses the guide of the model, which must read only data.
+    This prior is for a static latent w without parents. It evaluates the model's guide q(w | ...), which must read only
+    data over time. Source: Tomczak and Welling, 2018, arXiv 1705.07120.
 
     Args:
         components: K, number of pseudo-sequences.
-        steps: length of the pseudo-sequences.
+        steps: number of time steps of each pseudo-sequence.
     """
 
     components: int = 16
     steps: int = 16
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a static latent without parents whose guide reads data over time."""
+        """Return the module for a static latent without parents.
+
+        Raises:
+            ValueError: the variable is not a static latent without parents, or its guide reads something other than
+                data over time.
+        """
         return VampModule(self, shape)
 
 
@@ -121,8 +131,9 @@ class VampModule(Prior):
         reads = guide.parents if guide else ()
         if not reads or any(parent.name not in shape.data or not parent.local for parent in reads):
             raise ValueError(
-                f"a Vamp of {shape.name} needs a guide that reads the data {', '.join(shape.data)} over time and "
-                f"nothing else, such as q({shape.name} | {shape.data[0]}_{{1:T}}), not {guide or 'the prior itself'}"
+                f"a Vamp requires a guide of {shape.name} that reads the data {', '.join(shape.data)} over time "
+                f"and nothing else, such as q({shape.name} | {shape.data[0]}_{{1:T}}), got "
+                f"{guide or 'the prior as the guide'}"
             )
         self.components, self.steps = spec.components, spec.steps
         object.__setattr__(self, "guide", shape.guide)  # bypasses registration: the model already owns this module
@@ -135,16 +146,16 @@ class VampModule(Prior):
         """Set the pseudo-sequences to the first steps of K sequences.
 
         Args:
-            data: {name: values (K, T, D)}.
+            data: dictionary from each data variable that the guide reads to its values (K, T, D).
 
         Raises:
-            ValueError: the sequences are shorter than the pseudo-sequences.
+            ValueError: the sequences have fewer steps than the pseudo-sequences.
         """
         for name, pseudo in self.pseudo.items():
             if data[name].shape[1] < self.steps:
                 raise ValueError(
-                    f"a Vamp has pseudo-sequences of {self.steps} steps, but starts at {name} with "
-                    f"{data[name].shape[1]} steps; give it at most as many steps"
+                    f"the pseudo-sequences of this Vamp have {self.steps} steps, but the given sequences of {name} "
+                    f"have only {data[name].shape[1]}; give longer sequences, or build the Vamp with fewer steps"
                 )
             first = data[name][:, : self.steps]
             pseudo.copy_(self.guide.units[name].relative(first) if name in self.guide.units else first)
@@ -161,12 +172,14 @@ class VampModule(Prior):
 
 @dataclass(frozen=True)
 class Flow:
-    """A normalizing flow of N(0, I): alternating monotonic splines and affine couplings, then a location and scale.
+    """Normalizing flow for a static latent without parents: N(0, I), transformed by splines and couplings.
+
+    Monotonic splines and affine couplings alternate, followed by a location and a scale. In one dimension there are
+    only splines. Density and draws are exact and take one pass each. The initial weights are small, so the initial
+    distribution is close to N(0, I); with Pyro's initial weights it would have heavy tails.
 
     Sources: Dinh et al., 2017, arXiv 1605.08803 (couplings); Dolatabadi et al., 2020, arXiv 2001.05168 (linear rational
-    splines). Density and draws are exact and take one pass each. The initial weights are small, so the flow starts near
-    N(0, I); with Pyro's initial weights it would start far from it, with heavy tails. In one dimension there are no
-    couplings, only splines.
+    splines).
 
     Args:
         layers: number of layers; each has a spline and a coupling.
@@ -177,7 +190,11 @@ class Flow:
     bins: int = 8
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a static latent without parents."""
+        """Return the module for a static latent without parents.
+
+        Raises:
+            ValueError: the variable is not a static latent without parents.
+        """
         return FlowModule(self, shape)
 
 
@@ -204,14 +221,17 @@ class FlowModule(Prior):
 
     @override
     def prior(self) -> Any:
-        """Return the distribution of the flow.
+        """Return the distribution of the flow: batch shape (), event shape (D,).
 
         Raises:
-            ValueError: the parameters have half precision, which Pyro's splines do not support.
+            ValueError: the weights have half precision, which Pyro's splines do not support.
         """
         loc = self.loc
         if torch.finfo(loc.dtype).bits < 32:
-            raise ValueError(f"a Flow has no half precision, but its parameters are {loc.dtype}; use mixed precision")
+            raise ValueError(
+                f"a Flow does not support half precision, but its weights are {loc.dtype}; keep float32 weights and "
+                "fit with precision='bf16-mixed' or '32-true'"
+            )
         # Pyro's transforms cache their last input and output. Copies limit the cache to this distribution; otherwise it
         # would become stale when parameters change, and the module could not be deep-copied.
         reverse = transforms.Permute(torch.arange(len(loc) - 1, -1, -1, device=loc.device), cache_size=0)

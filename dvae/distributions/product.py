@@ -1,4 +1,4 @@
-"""Product: separate conditional distributions for parts of a variable, such as the columns of a table."""
+"""Separate conditional distributions for parts of a variable, such as the columns of a table."""
 
 from __future__ import annotations
 
@@ -20,11 +20,15 @@ from .base import ConditionalDistribution, DistributionSpec, Parameters, Shape, 
 
 @dataclass(frozen=True)
 class Product:
-    """Distributions of parts of a variable, independent given the parents: pairs of coordinates and a specification.
+    """Separate distributions of parts of a variable, which are independent given the parents.
 
-    The density is reported per coordinate. The density of a multivariate event (see
-    `ConditionalDistribution.distribution`) is assigned to its first coordinate. Single entries may be missing, but an
-    event can only be missing completely.
+    The log density has one value per coordinate. If a part is a multivariate event (`ConditionalDistribution`), its
+    density is assigned to its first coordinate. Single coordinates may be missing, but the coordinates of an event must
+    be all observed or all missing.
+
+    Args:
+        parts: pairs of the indices of a part's coordinates and the specification of its distribution. Each coordinate
+            must be in exactly one part.
 
     Example:
         >>> count = dvae.distributions.Family("Poisson")
@@ -68,7 +72,8 @@ class ProductModule(ConditionalDistribution):
         for index, part in enumerate(parts):
             if part.deterministic:
                 raise ValueError(
-                    f"the part {self.places[index]} of {shape.name} has no density; a Product needs all densities"
+                    f"the distribution {spec.parts[index][1]} of the coordinates {self.places[index]} of {shape.name} "
+                    "has no density, which a Product requires; use a distribution with a density, such as Normal()"
                 )
         self.register_buffer("order", _order(self.places), persistent=False)
         self.location_scale = any(part.location_scale for part in parts)
@@ -115,7 +120,11 @@ class ProductModule(ConditionalDistribution):
         return sum((self._part(n, features, previous, t) for n in range(len(self.parts))), ())
 
     def each(self, parameters: Parameters) -> list[tuple[Any, list[int], Parameters]]:
-        """Return the module, coordinates and parameters of every part."""
+        """Return for each part its module, the indices of its coordinates, and its parameters.
+
+        Args:
+            parameters: result of `forward`.
+        """
         split, start = [], 0
         for count in self.counts:
             split.append(parameters[start : start + count])
@@ -152,7 +161,7 @@ class ProductModule(ConditionalDistribution):
 
 
 def _order(parts: Iterable[Sequence[int]]) -> Tensor:
-    """Return the position of each coordinate in the concatenated parts."""
+    """Return the position (D,) of each coordinate in the concatenation of the parts, given their coordinates."""
     return torch.tensor(list(chain.from_iterable(parts))).argsort()
 
 
@@ -161,10 +170,11 @@ def _shape_options(shape: Shape) -> tuple[Any, ...]:
 
 
 class ProductDistribution(TorchDistribution):
-    """Independent distributions of parts of a value: batch (..., D), no event.
+    """Independent distributions of parts of a value: batch shape (..., D), event shape ().
 
     Args:
-        parts: pairs of coordinates and their distribution, with batch (..., n) or event (n,).
+        parts: pairs of the indices of n coordinates and their distribution. This has batch shape (..., n) without an
+            event, or batch shape (...) and event shape (n,).
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -181,7 +191,10 @@ class ProductDistribution(TorchDistribution):
         return torch.cat(parts, -1).index_select(-1, indices(self.order, parts[0]))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return (..., D), with the density of an event at its first coordinate and 0 at its others."""
+        """Return the log densities (..., D) of values (..., D), in nats.
+
+        The log density of an event is at its first coordinate; its other coordinates have 0.
+        """
         densities = []
         for places, distribution in self.parts:
             density = distribution.log_prob(value.index_select(-1, indices(places, value)))
@@ -191,11 +204,11 @@ class ProductDistribution(TorchDistribution):
         return self._concatenate(densities)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """Return a reparameterised draw (..., D)."""
+        """Return reparameterised draws (*sample_shape, ..., D)."""
         return self._concatenate([distribution.rsample(torch.Size(sample_shape)) for _, distribution in self.parts])
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Return a draw (..., D)."""
+        """Return draws (*sample_shape, ..., D)."""
         return self._concatenate([distribution.sample(torch.Size(sample_shape)) for _, distribution in self.parts])
 
     @property
@@ -210,12 +223,16 @@ class ProductDistribution(TorchDistribution):
 
     @property
     def support(self) -> constraints.Constraint:  # type: ignore[override]
-        """Support of the parts."""
+        """Constraint that combines the supports of the parts."""
         return ProductSupport([(places, distribution.support) for places, distribution in self.parts])
 
 
 class ProductSupport(constraints.Constraint):
-    """Constraints on parts of a value; `check` returns (..., D)."""
+    """Constraint that combines separate constraints on parts of a value.
+
+    Args:
+        parts: pairs of the indices of coordinates and torch's constraint on them.
+    """
 
     def __init__(self, parts: Sequence[tuple[list[int], Any]]):
         self.parts = parts
@@ -223,7 +240,7 @@ class ProductSupport(constraints.Constraint):
         self.event_dim = 0
 
     def check(self, value: Tensor) -> Tensor:
-        """Return whether each coordinate satisfies its constraint."""
+        """Return for each coordinate, (..., D), whether the constraint of its part holds for values (..., D)."""
         checks = []
         for places, support in self.parts:
             valid = support.check(value.index_select(-1, indices(places, value)))

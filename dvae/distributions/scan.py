@@ -1,4 +1,4 @@
-"""Recursions over T steps in blocks: run all blocks at once from zero, then correct each block for its initial state.
+"""Recursions over T steps in blocks: run all blocks in parallel from zero, then add the effect of their initial states.
 
 Consider a linear recursion with known matrices, x_{t+1} = F_t x_t + c_t, or a recursion of covariances,
 X_{t+1} = F_t X_t F_t' + C_t. A block of steps is again one step of the same kind. Its matrix is the product D of the F,
@@ -10,9 +10,9 @@ If C, W and D are computed for the solution with P_1 = 0, the solution for any P
 
     P_{t+1} = C_{t+1} + D_t (I + P_1 J_t)^-1 P_1 D_t'        J_t = D_0' G_1 W_1 D_0 + ... + D_{t-1}' G_t W_t D_{t-1}
 
-These are the A, C and J of the elements that Särkkä and García-Fernández (2021, arXiv 1905.13002) combine in pairs. The
-initial states of the blocks follow the same recursion with one step per block. Instead of T sequential steps there are
-16 or 32 at each of log T / log 16 levels, with twice the work and memory linear in T.
+Särkkä and García-Fernández (2021, arXiv 1905.13002) combine the same D, C and J, which they call A, C and J, in pairs.
+The initial states of the blocks follow the same recursion with one step per block. Instead of T sequential steps, there
+are 16 or 32 at each of log T / log 16 levels. This doubles the work; memory stays linear in T.
 """
 
 from __future__ import annotations
@@ -27,17 +27,24 @@ from torch.autograd.function import once_differentiable
 BLOCK = 16
 """Number of steps in a block. Run times with 8 or 32 differ by less than the variation between runs."""
 WIDE = 32
-"""Maximum rows per step (sequences times N). With more, a step keeps a core busy and blocks double the work."""
+"""Maximum number of rows per step (sequences times N) with which blocks are used.
+
+With more rows, a single step already keeps a core busy, and blocks would only double the work.
+"""
 
 
 def use_blocks(matrix: Tensor) -> bool:
-    """Return whether blocks are faster than sequential steps for matrices (T, B, N, N)."""
+    """Return whether a recursion with these matrices (T, B, N, N) is faster in blocks than in sequential steps."""
     steps, batch, size, _ = matrix.shape
     return steps >= 4 * BLOCK and batch * size <= min(WIDE, steps // 6)
 
 
 class Recursion:
-    """Linear recursions that share their matrices F (T, B, N, N)."""
+    """Linear recursions with the same matrices.
+
+    Args:
+        matrix: F_1 to F_T, (T, B, N, N).
+    """
 
     def __init__(self, matrix: Tensor):
         self.matrix = matrix
@@ -50,7 +57,12 @@ class Recursion:
         return Recursion(matrix), passed, Recursion(_last(passed, self.matrix))
 
     def states(self, offset: Tensor, start: Tensor) -> Tensor:
-        """Return all x (T + 1, B, N, M) for c (T, B, N, M) and x_1 (B, N, M)."""
+        """Return the states x_1 to x_{T+1} of x_{t+1} = F_t x_t + c_t, (T + 1, B, N, M).
+
+        Args:
+            offset: c_1 to c_T, (T, B, N, M).
+            start: x_1, (B, N, M).
+        """
         if use_blocks(self.matrix):
             within, passed, between = self._blocks
             from_zero = within.states(offset := _to_blocks(offset), torch.zeros_like(offset[0]))[1:]
@@ -62,7 +74,12 @@ class Recursion:
         return states
 
     def covariances(self, offset: Tensor, start: Tensor) -> Tensor:
-        """Return all X (T + 1, B, N, N) for C (T, B, N, N) and X_1 (B, N, N)."""
+        """Return the covariances X_1 to X_{T+1} of X_{t+1} = F_t X_t F_t' + C_t, (T + 1, B, N, N).
+
+        Args:
+            offset: C_1 to C_T, (T, B, N, N).
+            start: X_1, (B, N, N).
+        """
         if use_blocks(self.matrix):
             within, passed, between = self._blocks
             from_zero = within.covariances(offset := _to_blocks(offset), torch.zeros_like(offset[0]))[1:]
@@ -77,7 +94,17 @@ class Recursion:
 
 
 def riccati(transition: Tensor, noise: Tensor, information: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return all P (T + 1, B, N, N), W and F (T, B, N, N) for A, Q and G (T, B, N, N) and P_1 (B, N, N)."""
+    """Run the Riccati recursion of this module.
+
+    Args:
+        transition: A_1 to A_T, (T, B, N, N).
+        noise: Q_1 to Q_T, (T, B, N, N).
+        information: G_1 to G_T, (T, B, N, N).
+        start: P_1, (B, N, N).
+
+    Returns:
+        P_1 to P_{T+1}, (T + 1, B, N, N), and W_1 to W_T and F_1 to F_T, (T, B, N, N) each.
+    """
     if use_blocks(transition):
         a, q, g = (_to_blocks(values) for values in (transition, noise, information))
         from_zero, shrink, carry = riccati(a, q, g, torch.zeros_like(a[0]))
@@ -106,7 +133,7 @@ def riccati(transition: Tensor, noise: Tensor, information: Tensor, start: Tenso
 
 
 def products(matrix: Tensor) -> Tensor:
-    """Return D_t = F_t ... F_1 for all t, from F (T, B, N, N)."""
+    """Return the products D_t = F_t ... F_1 for all t, (T, B, N, N), of matrices F (T, B, N, N)."""
     results, steps = _allocate(matrix[0], len(matrix) - 1)
     for f, last, new in zip(matrix.unbind(0)[1:], steps, steps[1:], strict=False):
         torch.bmm(f, last, out=new)
@@ -114,39 +141,42 @@ def products(matrix: Tensor) -> Tensor:
 
 
 def symmetric(matrix: Tensor) -> Tensor:
-    """Return the symmetric part."""
+    """Return the symmetric part (M + M') / 2 of matrices M (..., N, N)."""
     return 0.5 * (matrix + matrix.mT)
 
 
 def _allocate(start: Tensor, steps: int) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Allocate memory for `steps` steps after the first, as a whole and by step; other layouts slow products down."""
+    """Return memory (steps + 1, ...) for the states of a recursion, and views of its steps.
+
+    The first state is set to `start`. Matrix products are slower with other memory layouts.
+    """
     memory = start.new_empty(steps + 1, *start.shape)
     memory[0] = start
     return memory, memory.unbind(0)
 
 
 def _to_blocks(values: Tensor) -> Tensor:
-    """Rearrange (T, B, ...) to the steps of all blocks, (BLOCK, blocks * B, ...); zeros pad the last block."""
+    """Rearrange values (T, B, ...) into blocks, (BLOCK, number of blocks * B, ...); zeros pad the last block."""
     values = torch.cat([values, values.new_zeros(-len(values) % BLOCK, *values.shape[1:])])
     return values.unflatten(0, (-1, BLOCK)).transpose(0, 1).flatten(1, 2).contiguous()
 
 
 def _from_blocks(values: Tensor, like: Tensor) -> Tensor:
-    """Invert `_to_blocks`, with the numbers of steps and sequences of `like`."""
+    """Invert `_to_blocks`, with the number of steps T and of sequences B of a tensor `like` (T, B, ...)."""
     return values.unflatten(1, (-1, like.shape[1])).transpose(0, 1).flatten(0, 1)[: len(like)]
 
 
 def _last(values: Tensor, like: Tensor) -> Tensor:
-    """Return the last step of all blocks, (blocks, B, ...), with the number of sequences of `like`."""
+    """Return the last step of each block, (number of blocks, B, ...), for a tensor `like` (T, B, ...)."""
     return values[-1].unflatten(0, (-1, like.shape[1]))
 
 
 class States(torch.autograd.Function):
-    """The states x (T + 1, B, N) from F (T, B, N, N), c (T, B, N) and x_1 (B, N)."""
+    """Autograd function from F (T, B, N, N), c (T, B, N) and x_1 (B, N) to the states x (T + 1, B, N)."""
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, offset: Tensor, start: Tensor) -> Tensor:
-        """Run the recursion."""
+        """Return the states."""
         states = Recursion(matrix).states(offset[..., None], start[..., None])[..., 0]
         ctx.save_for_backward(matrix, states)
         return states
@@ -154,18 +184,21 @@ class States(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Run the adjoint recursion, backward in time."""
+        """Return the gradients of F, c and x_1, given the gradient of the states."""
         matrix, states = ctx.saved_tensors
         total = backward(matrix).states(*from_last(gradient[..., None])).flip(0)
         return total[1:] @ states[:-1, ..., None].mT, total[1:, ..., 0], total[0, ..., 0]
 
 
 class Covariances(torch.autograd.Function):
-    """The covariances X (T + 1, B, N, N) from F and C (T, B, N, N) and X_1 (B, N, N); C, X_1 and X are symmetric."""
+    """Autograd function from F, C (T, B, N, N) and X_1 (B, N, N) to the covariances X (T + 1, B, N, N).
+
+    C, X_1 and X are symmetric.
+    """
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, offset: Tensor, start: Tensor) -> Tensor:
-        """Run the recursion."""
+        """Return the covariances."""
         covariances = symmetric(Recursion(matrix).covariances(offset, start))
         ctx.save_for_backward(matrix, covariances)
         return covariances
@@ -173,17 +206,20 @@ class Covariances(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Run the adjoint recursion, backward in time."""
+        """Return the gradients of F, C and X_1, given the gradient of the covariances."""
         matrix, covariances = ctx.saved_tensors
         total = symmetric(backward(matrix).covariances(*from_last(symmetric(gradient))).flip(0))
         return 2 * total[1:] @ matrix @ covariances[:-1], total[1:], total[0]
 
 
 def backward(matrix: Tensor) -> Recursion:
-    """Return the recursion of gradients, from the last state to the first."""
+    """Return the recursion of the gradients of the states, from the last state to the first, for F (T, B, N, N)."""
     return Recursion(matrix.mT.flip(0))
 
 
 def from_last(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Split values into the offsets and the initial state of a recursion from the last step to the first."""
+    """Return the offsets (T, ...) and the initial state (...) of a backward recursion from values (T + 1, ...).
+
+    The initial state is the last value; the offsets are the other values in reverse order.
+    """
     return values[:-1].flip(0), values[-1]

@@ -22,14 +22,17 @@ from ..options import Share, check
 
 @dataclass(frozen=True)
 class Subset:
-    """A subset of the indices of a variable: a fixed share, drawn uniformly without replacement.
+    """Random subset of the indices of a variable: a fixed share of them, drawn uniformly without replacement.
 
-    With a curriculum, the subset initially contains the first indices. Later, an increasing number of them is replaced
-    by other indices, up to the expected number in a uniform draw. With several processes, each draws for its own part
-    of a batch.
+    With a curriculum, the subset initially consists of the first indices. As training progresses, an increasing number
+    of them is replaced by other random indices, up to the expected number in a uniform draw. If training uses several
+    processes, each process draws a subset for its own part of a batch.
 
     Args:
         share: share of the indices, from 0 to 1; the number of chosen indices is rounded up.
+
+    Raises:
+        ValueError: `share` is not from 0 to 1.
     """
 
     share: Share
@@ -38,7 +41,7 @@ class Subset:
         check(self)
 
     def chosen(self, size: int) -> int:
-        """Return the number of chosen indices out of `size`."""
+        """Return how many of `size` indices are chosen."""
         return ceil(self.share * size - 1e-9)  # rounding error must not turn 0.3 * 10 into 4
 
     def distribution(self, size: int, curriculum: float = 1.0) -> SubsetDistribution:
@@ -46,7 +49,7 @@ class Subset:
 
         Args:
             size: L, number of indices.
-            curriculum: progress of the curriculum, from 0 to 1.
+            curriculum: progress of the curriculum, from 0 (the first indices) to 1 (a uniform draw).
         """
         n_chosen = self.chosen(size)
         most = round(n_chosen * (size - n_chosen) / size)
@@ -61,6 +64,9 @@ class SubsetDistribution(TorchDistribution):
         size: L, number of indices.
         chosen: number of ones.
         swapped: number of ones that are not among the first `chosen` indices; None for any number.
+
+    Raises:
+        ValueError: there are no vectors with these numbers of ones.
     """
 
     arg_constraints: ClassVar[dict[str, Any]] = {}
@@ -68,13 +74,16 @@ class SubsetDistribution(TorchDistribution):
 
     def __init__(self, size: int, chosen: int, swapped: int | None = None) -> None:
         if not 0 <= chosen <= size or not 0 <= (swapped or 0) <= min(chosen, size - chosen):
-            raise ValueError(f"cannot choose {chosen} of {size} indices, {swapped} of them not among the first")
+            raise ValueError(
+                "`chosen` must be from 0 to `size`, and `swapped` from 0 to min(chosen, size - chosen); "
+                f"got size={size}, chosen={chosen}, swapped={swapped}"
+            )
         self.size, self.chosen, self.swapped = size, chosen, swapped
         super().__init__(torch.Size(), torch.Size([size]), validate_args=False)
 
     @lazy_property
     def _log_number(self) -> float:
-        """Log of the number of possible subsets."""
+        """Natural logarithm of the number of possible subsets."""
         if self.swapped is None:
             return _log_choose(self.size, self.chosen)
         return _log_choose(self.chosen, self.swapped) + _log_choose(self.size - self.chosen, self.swapped)
@@ -96,7 +105,7 @@ class SubsetDistribution(TorchDistribution):
 
 
 def _random_subset(shape: torch.Size, size: int, count: int) -> Tensor:
-    """Return (*shape, size) with ones at `count` random places."""
+    """Return a tensor (*shape, size) of zeros with ones at `count` random indices of the last dimension."""
     positions = torch.rand(*shape, size).argsort(-1)[..., :count]
     return torch.zeros(*shape, size).scatter(-1, positions, 1.0)
 

@@ -19,20 +19,34 @@ from .base import ConditionalDistribution, Parameters, Shape
 
 @dataclass(frozen=True)
 class Triangular:
-    """A normal with full covariance; the features are its location and whitening matrix."""
+    """Multivariate normal with full covariance whose parameters are the features.
+
+    The D + D^2 features are the location (D,) and the flattened whitening matrix U (D, D), which is lower triangular
+    with a positive diagonal. The covariance is (U'U)^-1. Networks such as `networks.LinearSDE` return these features.
+    """
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Raises:
+            ValueError: the number of features is not D + D^2.
+        """
         n_features = shape.size + shape.size**2
         if shape.features != n_features:
             raise ValueError(
-                f"a Triangular distribution takes {n_features} features, but the network gives {shape.features}"
+                f"Triangular requires {n_features} features, a location of size {shape.size} and a {shape.size} x "
+                f"{shape.size} matrix, but the network returns {shape.features}; use a network for Triangular, such as "
+                "networks.LinearSDE"
             )
         return TriangularModule(shape.size)
 
 
 class TriangularModule(ConditionalDistribution):
-    """Distribution module of `Triangular`; its parameters have shapes (..., D) and (..., D * D)."""
+    """Distribution module of `Triangular`; its parameters are the location (..., D) and the flattened U (..., D * D).
+
+    Args:
+        size: D, dimension of the variable.
+    """
 
     event_dim = 1
 
@@ -55,13 +69,14 @@ class TriangularModule(ConditionalDistribution):
 
 
 class TriangularNormal(TorchDistribution):
-    """N(loc, (U'U)^-1) with a lower triangular U: batch (...), event (D,).
+    """N(loc, (U'U)^-1) with a lower triangular U: batch shape (...), event shape (D,).
 
         log p(v) = sum_d log U_dd - e_d^2 / 2 - log(2 pi) / 2,        e = U (v - loc)
 
     Args:
-        loc: (..., D).
+        loc: location (..., D).
         whitening: U, (..., D, D), lower triangular with a positive diagonal.
+        validate_args: whether torch checks the arguments; its global setting if None.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {
@@ -81,25 +96,28 @@ class TriangularNormal(TorchDistribution):
         return self.loc
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """Return draws (*sample_shape, ..., D)."""
+        """Return reparameterised draws (*sample_shape, ..., D)."""
         shape = self._extended_shape(torch.Size(sample_shape))
         return self.color(torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device))
 
     def color(self, noise: Tensor) -> Tensor:
-        """Return the value v with e = `noise`."""
+        """Return the values v = loc + U^-1 e (..., D) for noise e (..., D)."""
         return self.loc + torch.linalg.solve_triangular(self.whitening, noise[..., None], upper=False)[..., 0]
 
     def whiten(self, value: Tensor) -> Tensor:
-        """Return e, which is standard normal if the value follows this distribution."""
+        """Return e = U (v - loc), (..., D), for values v (..., D).
+
+        If v follows this distribution, e is standard normal.
+        """
         return (self.whitening @ (value - self.loc)[..., None])[..., 0]
 
     @property
     def log_precision(self) -> Tensor:
-        """The sum of log U_dd, (...)."""
+        """Half the log-determinant of the precision matrix: the sum of log U_dd, (...)."""
         return self.whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density (...), in nats."""
+        """Return the log density (...) of values (..., D), in nats."""
         constant = self.event_shape[0] * math.log(2 * math.pi)
         return self.log_precision - 0.5 * ((self.whiten(value) ** 2).sum(-1) + constant)
 
@@ -119,15 +137,15 @@ def _from_triangular(q: TriangularNormal, p: TriangularNormal) -> Tensor:
 
 
 class InverseCholesky(torch.autograd.Function):
-    """Map S (..., D, D) to the lower triangular U with U'U = S^-1; nan where S is not symmetric positive definite.
+    """Autograd function from S (..., D, D) to the lower triangular U with U'U = S^-1.
 
-    The backward pass takes three matrix products, whereas torch's solves triangular systems. It returns a matrix whose
-    symmetric part is the gradient.
+    U is nan if S is not positive definite. The backward pass needs three matrix products, whereas torch's backward pass
+    solves triangular systems. It returns a matrix whose symmetric part is the gradient, since S is symmetric.
     """
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor) -> Tensor:
-        """Return U."""
+        """Return U (..., D, D) for S (..., D, D)."""
         root, info = torch.linalg.cholesky_ex(matrix)
         identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
         inverse = torch.linalg.solve_triangular(root, identity, upper=False)
@@ -138,7 +156,10 @@ class InverseCholesky(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_inverse: Tensor) -> Tensor:
-        """Return the gradient from dU = -Phi(U dS U') U; Phi keeps the lower triangle and half of the diagonal."""
+        """Return the gradient of S, given the gradient of U.
+
+        It follows from dU = -Phi(U dS U') U, where Phi keeps the part below the diagonal and half of the diagonal.
+        """
         (inverse,) = ctx.saved_tensors
         size = inverse.shape[-1]
         lower = torch.ones(size, size, dtype=inverse.dtype, device=inverse.device).tril_()
@@ -147,12 +168,16 @@ class InverseCholesky(torch.autograd.Function):
 
 
 def refuse_half(dtype: torch.dtype) -> None:
-    """Raise an error for parameters in half precision.
+    """Raise an error if a dtype has half precision.
+
+    Args:
+        dtype: dtype of the parameters of a model that inverts covariances.
 
     Raises:
-        ValueError: the dtype has half precision; the message names the supported precisions.
+        ValueError: the dtype is bfloat16 or float16.
     """
     if dtype in (torch.bfloat16, torch.float16):
         raise ValueError(
-            f"covariances are inverted, which {dtype} does not support; fit with precision='bf16-mixed' or '32-true'"
+            f"the model inverts covariances, which {dtype} does not support; fit with precision='bf16-mixed' or "
+            "'32-true'"
         )

@@ -1,4 +1,7 @@
-"""Figures of graphs, unrolled or of one step: time from left to right, latents open, data shaded, context squares."""
+"""Figures of the graph of a factorization, unrolled over time or for one step.
+
+Time runs from left to right. Latents are open circles, data shaded circles and context variables squares.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,9 @@ if TYPE_CHECKING:
     from matplotlib.patches import Patch
 
 Node = tuple[str, int | None]
-"""A variable at a step, or a static variable with step None."""
+"""Node of a graph: (name, t) for a local variable at step t, (name, None) for a static variable."""
 Edge = tuple[Node, Node]
+"""Edge of a graph: (parent, child)."""
 
 RADIUS = 0.3
 ARROW: dict[str, Any] = {"shrinkA": 0, "shrinkB": 0, "arrowstyle": "-|>", "mutation_scale": 9, "zorder": 2}
@@ -23,19 +27,22 @@ EDGE: dict[str, Any] = {"color": "0.35", "linestyle": "-", "linewidth": 0.9}
 MISSING: dict[str, Any] = {"color": "#c0392b", "linestyle": "--", "linewidth": 1.3}
 REDUNDANT: dict[str, Any] = {"color": "0.6", "linestyle": ":", "linewidth": 1.2}
 LEAST = 1e-3
-"""Share of the highest KL gap below which an edge is drawn dotted, as if its gap were zero."""
+"""An edge is drawn dotted, as if its KL gap were zero, if the gap is at most this share of the highest gap."""
 
 
 def draw_dag(
     dag: nx.DiGraph, ax: Axes | None = None, missing: Iterable[Edge] = (), redundant: Iterable[Edge] = ()
 ) -> Axes:
-    """Draw an unrolled graph: time left to right, latents open, data shaded, context squares.
+    """Draw a graph that is unrolled over time.
 
     Args:
-        dag: graph of `Factorization.dag`, with nodes (name, t) or (name, None) and attribute `kind`.
+        dag: graph from `Factorization.dag`, with nodes (name, t) or (name, None) and node attribute `kind`.
         ax: matplotlib axes; a new figure if None.
-        missing: edges to add, dashed red.
-        redundant: edges of the graph to show dotted grey.
+        missing: edges between nodes of the graph that the graph does not contain, drawn dashed and red.
+        redundant: edges of the graph that are drawn dotted and grey.
+
+    Returns:
+        The matplotlib axes.
     """
     import matplotlib.pyplot as plt
 
@@ -65,15 +72,21 @@ def draw_slice(
     top: float = 0.0,
     unsure: Collection[tuple[Any, Any]] = (),
 ) -> Axes:
-    """Draw what one step reads, with the past on the left, the future on the right, and edge widths by KL gap.
+    """Draw the graph of one step, with the past on the left and the future on the right.
+
+    The width of an edge increases with its KL gap.
 
     Args:
-        graph: graph of `Factorization.slice`.
-        costs: KL gap of each edge, printed at the edge. A gap of about 0 or less is dotted; an edge without one is
-            thin.
+        graph: graph from `Factorization.slice`.
+        costs: KL gap of each edge in nats, from (parent node, child node); it is printed on the edge. Edges with a gap
+            of about 0 or less are dotted. Edges that are not in `costs` are thin and without a number.
         ax: matplotlib axes.
-        top: KL gap of the widest edge; at least the highest of `costs`.
-        unsure: edges to draw in a lighter colour.
+        top: KL gap in nats that is drawn with the greatest width, so that several figures can share one scale. The
+            highest gap in `costs` is used if it is larger.
+        unsure: edges that are drawn in a lighter colour, such as those with an insignificant gap.
+
+    Returns:
+        The matplotlib axes.
     """
     positions = _slice_layout(graph)
     patches = {
@@ -98,7 +111,7 @@ def draw_slice(
 
 
 def _draw_node(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch:
-    """Draw a node with its label."""
+    """Draw a node with its label and return its outline, at which edges end."""
     from matplotlib.patches import Circle, Rectangle
 
     (x, y), side = xy, 2 * RADIUS
@@ -133,7 +146,11 @@ def _hide_axes(ax: Axes) -> Axes:
 
 
 def _layout(dag: nx.DiGraph) -> dict[Node, tuple[float, float]]:
-    """Place static nodes on top, then one row per local variable, data last; shifted rows separate their edges."""
+    """Return the position (x, y) of each node of an unrolled graph.
+
+    Static nodes are in the top row. Each local variable has a row below, and data have the last rows. Rows are shifted
+    horizontally, so that edges between different rows do not overlap.
+    """
     T = max((t for _, t in dag if t is not None), default=1)
     static = [node for node in dag if node[1] is None]
     last = {name for name, t in dag if dag.nodes[name, t].get("kind") == "data"}
@@ -148,7 +165,11 @@ def _layout(dag: nx.DiGraph) -> dict[Node, tuple[float, float]]:
 
 
 def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
-    """Place static nodes on top, then one row per local variable, data last; past and future at the sides."""
+    """Return the position (x, y) of each node in the graph of one step.
+
+    Static nodes are in the top row. Each local variable has a row below, and data have the last rows. Past steps are on
+    the left, step t is in the middle, and future steps are on the right.
+    """
     local = {name: graph.nodes[name, sub]["kind"] == "data" for name, sub in graph if sub is not None}
     rows = {name: row for row, name in enumerate(sorted(local, key=local.__getitem__), start=1)}
     positions: dict[Any, tuple[float, float]] = {}
@@ -165,7 +186,10 @@ def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
 
 
 def _bend(source: Any, target: Any, positions: Mapping[Any, tuple[float, float]]) -> float:
-    """Return the smallest curvature that keeps an edge off all other nodes; edges in outer rows bend outwards."""
+    """Return the smallest curvature with which an edge does not touch other nodes, as the `rad` of matplotlib's arc3.
+
+    Edges within the lowest row preferably bend downwards, edges within other rows upwards.
+    """
     start, end = np.array(positions[source]), np.array(positions[target])
     others = np.array([xy for node, xy in positions.items() if node not in (source, target)]).reshape(-1, 2)
     (dx, dy), along = end - start, np.linspace(0, 1, 60)[:, None]

@@ -1,8 +1,8 @@
-"""Factorizations as graphs: audit whether a guide can represent the exact posterior, and draw both.
+"""Factorizations as graphs: audit whether a guide can represent the exact posterior, and list guides that can.
 
-The exact posterior of a latent, given the data and the latents that the guide has already drawn, depends on its Markov
-boundary among them (`dvae.factorization.inversion`). If a guide cannot read the whole boundary, its bound is not tight,
-however large its networks are.
+The exact posterior of a latent, given the data and the latents that the guide has already drawn, depends only on some
+of these variables: the Markov boundary of the latent (`dvae.factorization.inversion`). If a guide does not read the
+whole boundary, its bound is not tight, however large its networks are.
 """
 
 from __future__ import annotations
@@ -29,22 +29,26 @@ if TYPE_CHECKING:
 def analytic_kl(
     generative: Factorization, inference: Factorization, hidden: Iterable[str] = (), steps: int | None = None
 ) -> dict[str, bool]:
-    """Return for which latents the bound may use the analytic KL(q(z_t | ...) || p(z_t | ...)).
+    """Return for each latent z whether the bound may use the analytic KL(q(z_t | ...) || p(z_t | ...)).
 
     The analytic form fixes the parents of z_t in the model and averages over z_t. It is therefore unbiased exactly if
-    no such parent is a descendant of z_t in the guide. A backward guide q(z_t | z_{>t}, ...) for p(z_t | z_{t-1}) draws
-    z_{t-1} from z_t, so the analytic form would be biased and the log-ratio is averaged instead.
+    no such parent is a descendant of z_t in the guide. For example, a backward guide q(z_t | z_{>t}, ...) of
+    p(z_t | z_{t-1}) draws z_{t-1} from z_t. The analytic form would then be biased, so the bound averages
+    log q - log p over draws.
 
-    The model replaces hidden data by its own mean, a function of the parents of that mean. These parents then count as
-    parents of z_t too.
+    The model replaces missing data by its own mean, which is a function of other variables. If z_t depends on replaced
+    data, these variables count as parents of z_t too.
 
     Args:
-        generative, inference: p and q.
-        hidden: names of the data with entries replaced by the model's own means (missing, or scheduled sampling).
-        steps: T of the run. If None, the answer holds at every length; with custom masks, at T = 16.
+        generative: p, factorization of the model.
+        inference: q, factorization of the guide.
+        hidden: names of data variables with entries that the model replaces by its own mean, because they are missing
+            or because of scheduled sampling.
+        steps: length T of the sequences. If None, the result holds at every length, or only at T = 16 if there are
+            custom masks.
 
     Returns:
-        {latent: True if the analytic form is unbiased}, in the guide's drawing order.
+        Dictionary from latent to whether the analytic form is unbiased, in the guide's drawing order.
     """
     relations, hidden = _relations(generative, inference), frozenset(hidden)
     if any(relation.intervals is None for relation in relations):
@@ -95,18 +99,20 @@ class _TextTable:
 
 @dataclass(frozen=True)
 class Audit(_TextTable):
-    """Comparison of what a guide reads with what the exact posterior depends on.
+    """Comparison of the variables that a guide reads with those that the exact posterior depends on.
+
+    Printing an audit shows a table with one row per guide factor.
 
     Args:
-        generative: the model.
-        inference: the guide.
+        generative: factorization p of the model.
+        inference: factorization q of the guide.
         observed: names of the observed variables.
-        missing_parents: for each latent, the parents that the exact posterior depends on and the guide factor does not
-            read. Without them the bound cannot be tight.
-        redundant_parents: for each latent, parents of the guide factor of which the latent is independent given the
-            other parents. Dropping them loses nothing.
-        steps: the only length T for which the audit holds if there are custom masks, which may differ between lengths;
-            None if it holds for all lengths.
+        missing_parents: dictionary from latent to the parents that its exact posterior depends on, but its guide factor
+            does not read. The bound can be tight only if there are none.
+        redundant_parents: dictionary from latent to the parents that its guide factor reads, although the latent is
+            independent of them given the other parents. The guide loses nothing without them.
+        steps: length T for which the audit holds if there are custom masks, which may differ between lengths. None
+            without custom masks; the audit then holds for all lengths.
         summed: names of latents that are summed out.
 
     Example:
@@ -127,22 +133,25 @@ class Audit(_TextTable):
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
-        """{latent: relations as text}, such as `{"z": ("z_{<t}",)}`, for latents with missing parents."""
+        """Missing parents of each latent as text, such as `{"z": ("z_{<t}",)}`; without any, a latent has no entry."""
         return _terms(self.missing_parents)
 
     @property
     def redundant(self) -> dict[str, tuple[str, ...]]:
-        """{latent: relations as text}, for latents with redundant parents."""
+        """Redundant parents of each latent as text, as in `missing`; without any, a latent has no entry."""
         return _terms(self.redundant_parents)
 
     @property
     def exact(self) -> bool:
-        """True if nothing is missing: with a flexible enough family the bound can equal the evidence."""
+        """Whether no parent is missing.
+
+        The bound of an exact guide can equal the log evidence if its distributions are flexible enough.
+        """
         return not self.missing
 
     @property
     def rows(self) -> list[tuple[str, str, str]]:
-        """Rows (guide factor, missing, redundant) as text, in the guide's drawing order."""
+        """Rows of text (guide factor, missing parents, redundant parents), in the guide's drawing order."""
         names = [name for block in self.inference.blocks for name in block.names]
         return [
             (
@@ -155,7 +164,7 @@ class Audit(_TextTable):
 
     @property
     def verdict(self) -> str:
-        """A sentence: whether the guide misses dependencies, and which of its variables the model does not contain."""
+        """Sentence that states whether parents are missing and which variables of the guide are not in the model."""
         model_names = {*self.generative.variables, *self.generative.context}
         unknown = [name for name in self.inference.context if name not in model_names]
         note = f"; {', '.join(unknown)} in the guide has no factor and is context that the data give" if unknown else ""
@@ -179,16 +188,23 @@ class Audit(_TextTable):
 
     @property
     def repaired(self) -> Factorization:
-        """The guide with the missing and without the redundant parents, in the same drawing order; see
-        `faithful_inverse`.
+        """Guide with all missing and no redundant parents, derived by `faithful_inverse` for the same drawing order.
 
         Raises:
-            ValueError: the model contains a custom mask.
+            ValueError: the model has a custom mask.
         """
         return faithful_inverse(self.generative, self.observed, self.inference.blocks, self.summed)
 
     def draw(self, T: int = 3, ax: Axes | None = None) -> Axes:
-        """Draw the guide over T steps: missing edges dashed red, redundant edges dotted grey."""
+        """Draw the guide unrolled over time, with missing edges dashed and red, redundant edges dotted and grey.
+
+        Args:
+            T: number of time steps.
+            ax: matplotlib axes; a new figure if None.
+
+        Returns:
+            The matplotlib axes.
+        """
         dag = self.inference.dag(T, self.observed)
         redundant = self._edges(self.redundant_parents, T)
         missing = self._edges(self.missing_parents, T)
@@ -213,29 +229,34 @@ def audit(
     observed: Iterable[str] = ("x",),
     summed: Iterable[str] = (),
 ) -> Audit:
-    """Compare what each factor of a guide reads with what the exact posterior factor depends on.
+    """Compare the variables that each factor of a guide reads with those that the exact posterior factor depends on.
 
-    The exact factor is p(latent | latents the guide has already drawn, all data and context). A variable that the guide
-    draws at all steps at once counts as drawn forward in time.
+    The exact factor is p(latent | latents the guide has already drawn, all data and context). If the guide draws a
+    variable at all steps at once, the audit treats its steps as drawn one after the other, forward in time.
 
-    The audit unrolls both graphs and compares `steps` inner steps. It excludes the first and last steps, which have no
-    past or no future to depend on. More steps are compared if a relation has a longer lag. A pattern that is periodic
-    in time (a lag of 2 without a lag of 1) is listed only within these steps.
+    The audit unrolls both graphs and compares `steps` inner steps, or more if a relation has a long lag. It excludes
+    the first and last steps, because they have no past or no future to depend on. If a dependency is periodic in time
+    (a lag of 2 without a lag of 1), the result lists only the lags within the compared steps.
 
-    A custom mask is known only at a given length and may treat some steps differently. The graphs are then compared at
-    all of exactly `steps` steps, and the verdict reports this length.
+    A custom mask is known only at a given length and may treat some steps differently. With custom masks, the audit
+    therefore unrolls exactly `steps` steps, compares all of them, and names this length in its verdict.
 
     Args:
         generative: p, a factorization or its text.
-        inference: q, a factorization or its text; "" without latents; the prior if None.
-        steps: number of inner steps compared, 5 if None. With custom masks, the length T at which they will be used,
-            16 if None.
+        inference: q, a factorization or its text; "faithful" for the guide that `faithful_inverse` derives; None for
+            the prior; "" for a model without latents.
+        steps: number of compared inner steps, 5 if None. With custom masks, the length T at which the model will be
+            used, 16 if None.
         observed: names of the observed variables.
-        summed: names of latents that are summed out (`Discrete`); the posterior of the others is not conditioned on
-            them.
+        summed: names of latents that are summed out (`Discrete`). The guide does not draw them, so the posteriors of
+            the other latents do not condition on them.
+
+    Returns:
+        The missing and the redundant parents of each guide factor.
 
     Raises:
-        ValueError: the guide does not fit the model, as defined by `dvae.factorization.notation.check_pair`.
+        ValueError: a text cannot be parsed, or the guide does not fit the model
+            (`dvae.factorization.notation.check_pair`).
 
     >>> dvae.audit("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})").missing
     {'z': ('z_{t-1}',)}
@@ -286,14 +307,15 @@ def audit(
 
 @dataclass(frozen=True)
 class Derived:
-    """A guide that misses nothing, derived by `faithful_inverse`.
+    """A guide without missing parents, derived by `faithful_inverse` for one drawing order.
 
     Args:
         order: drawing order of the latents.
-        inference: the guide.
-        edges: number of edges of its unrolled graph.
-        looped: latents that are drawn step by step; the others are drawn at all steps at once.
-        sampled: latents whose KL has no closed form under this guide, so that the bound contains sampling noise.
+        inference: factorization of the guide.
+        edges: number of edges of the guide's graph, unrolled over `Alternatives.steps` steps.
+        looped: names of latents that are drawn step by step; the others are drawn at all steps at once.
+        sampled: names of latents whose KL term has no unbiased closed form under this guide (`analytic_kl`). The bound
+            averages these terms over draws, which adds sampling noise.
     """
 
     order: Order
@@ -305,12 +327,15 @@ class Derived:
 
 @dataclass(frozen=True)
 class Alternatives(_TextTable):
-    """The guides of a model that miss nothing. Guides without a loop are first, then those with the fewest edges.
+    """All guides of a model that `faithful_inverse` derives, none of which has missing parents.
+
+    Guides without a loop over time come first, sorted by their number of edges, then guides with a loop, sorted in the
+    same way. Index an object with i for the factorization of guide i; `len` returns the number of guides.
 
     Attributes:
-        generative: the model.
-        guides: the guides to choose from.
-        steps: T of the graphs whose edges were counted.
+        generative: factorization of the model.
+        guides: the guides in this order.
+        steps: number of time steps T over which `Derived.edges` are counted.
 
     Example:
         >>> guides = dvae.alternatives("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")
@@ -326,7 +351,7 @@ class Alternatives(_TextTable):
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
-        """Rows (guide, order, edges, latents drawn in a loop, latents whose KL is averaged over draws) as text."""
+        """Rows of text (guide, drawing order, edges, latents drawn in a loop, latents whose KL is sampled)."""
         return [
             (
                 each.inference.text,
@@ -340,7 +365,7 @@ class Alternatives(_TextTable):
 
     @property
     def verdict(self) -> str:
-        """A caption for the table."""
+        """Caption of the table."""
         guides = "each reads what the posterior depends on in its order (see `faithful_inverse`)"
         return f"{guides}; edges of {self.steps} steps"
 
@@ -366,16 +391,17 @@ class Alternatives(_TextTable):
 def alternatives(
     generative: Factorization | str, observed: Iterable[str] = ("x",), steps: int = 10, summed: Iterable[str] = ()
 ) -> Alternatives:
-    """Return all guides that `faithful_inverse` derives, one for each drawing order, without duplicates.
+    """Return all guides that `faithful_inverse` derives, one for each drawing order in `orders`, without duplicates.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
-        steps: T at which edges are counted.
+        steps: number of time steps T over which edges are counted, at least 1.
         summed: names of latents that are summed out, as in `faithful_inverse`.
 
     Raises:
-        ValueError: `steps` is less than 1, the model has no latents, or `faithful_inverse` raises it.
+        ValueError: `steps` is less than 1, the model has no latents, an observed variable is not in the model, or the
+            model has a custom mask.
 
     Example:
         >>> print(dvae.alternatives("p(z_t | z_{t-1}) p(x_t | z_t)"))
@@ -386,12 +412,15 @@ def alternatives(
     """
     generative, observed, summed = Factorization.parse(generative), tuple(observed), tuple(summed)
     if steps < 1:
-        raise ValueError(f"steps must be at least 1 to count edges, got {steps}")
+        raise ValueError(f"`steps` must be at least 1 (number of time steps over which edges are counted), got {steps}")
     unique: dict[frozenset[Factor], Derived] = {}
     for order in orders(generative, observed, summed):
         inference = faithful_inverse(generative, observed, order, summed)
         if not inference.factors:
-            raise ValueError(f"{generative.text!r} has no latents, so no guide can be derived")
+            raise ValueError(
+                f"{generative.text!r} has no latents, so no guide can be derived; give a model with a latent, such as "
+                "p(z_t | z_{t-1}) p(x_t | z_t)"
+            )
         looped = tuple(name for block in inference.blocks if block.direction for name in block.names)
         closed = analytic_kl(generative, inference)
         closed |= {f.child: False for f in generative.factors if f.child in closed and any(map(f.parent, summed))}

@@ -4,9 +4,9 @@ The posterior of latents that are drawn one after the other is prod_i p(v_i | v_
 its Markov boundary among the given variables. d-separation is a compositional graphoid, so this boundary is unique: it
 contains v if v is not d-separated from v_i by all other given variables (Pearl, 1988).
 
-A guide that reads exactly the boundary misses nothing, and all of its edges are necessary. Each order has its own such
-guide (Webb, Golinski, Zinkov, Siddharth, Rainforth, Teh and Wood, 2018, arXiv 1712.00287). Boundaries are computed in
-the graph unrolled over time, by the moral-graph criterion (Lauritzen, Dawid, Larsen and Leimer, 1990), and converted
+A guide that reads exactly the boundary misses no dependency, and all of its edges are necessary. Each order has its own
+such guide (Webb, Golinski, Zinkov, Siddharth, Rainforth, Teh and Wood, 2018, arXiv 1712.00287). Boundaries are computed
+in the graph unrolled over time, by the moral-graph criterion (Lauritzen, Dawid, Larsen and Leimer, 1990), and converted
 back into relations.
 """
 
@@ -26,16 +26,18 @@ from .notation import Block, Factor, Factorization, Parent, unrolled
 from .relations import ALL, MaskFunction, Relation
 
 FAITHFUL = "faithful"
-"""Value in place of a guide's equations that selects the guide derived by `faithful_inverse`."""
+"""Text that can replace the equations of a guide; it selects the guide that `faithful_inverse` derives."""
 Order = tuple[Block, ...]
-"""Blocks of latents in drawing order; each block is drawn at all of its steps before the next one."""
+"""Blocks of latents in drawing order; all steps of a block are drawn before the next block."""
 
 
 class MarkovBoundaries:
-    """The Markov boundaries of the nodes of a graph; sets of nodes are stored as the bits of integers.
+    """Markov boundaries of the nodes of a graph.
+
+    Sets of nodes are stored as integers with one bit per node.
 
     Args:
-        dag: directed acyclic graph, edges from parent to child.
+        dag: directed acyclic graph with edges from parent to child.
     """
 
     def __init__(self, dag: nx.DiGraph):
@@ -45,9 +47,10 @@ class MarkovBoundaries:
         self.children = [self._to_bits(dag.succ[node]) for node in self.nodes]
 
     def of(self, node: Node, given: AbstractSet[Node]) -> set[Node]:
-        """Return the smallest part of `given` that makes `node` independent of the rest of `given`.
+        """Return the Markov boundary of a node.
 
-        The boundary contains u exactly if `node` and u are not d-separated by the other given nodes. Other nodes are
+        It is the smallest subset of `given` that makes the node independent of the rest of `given`. It contains a given
+        node u exactly if the other given nodes do not d-separate `node` from u. All nodes that are not given are
         integrated out.
 
         Args:
@@ -90,12 +93,14 @@ def _bit_indices(bits: int) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Unrolled:
-    """Variables over the inner steps of an unrolled graph, between margins that are excluded from the result.
+    """The inner steps of an unrolled graph, for which dependencies are converted into relations.
+
+    The first and last steps of the graph are margins. Results exclude them, because their past or future is cut off.
 
     Args:
-        local: {name: whether the variable has one value per step}.
-        width: number of inner steps.
-        margin: number of steps on either side.
+        local: dictionary from variable to whether it has one value per step (True) or per sequence (False).
+        width: W, number of inner steps.
+        margin: number of steps before and after the inner steps.
     """
 
     local: Mapping[str, bool]
@@ -104,11 +109,11 @@ class Unrolled:
 
     @property
     def length(self) -> int:
-        """T, the number of steps with both margins."""
+        """Number of steps T of the graph, including both margins."""
         return self.width + 2 * self.margin
 
     def nodes(self, name: str) -> list[Node]:
-        """Return the nodes of a variable."""
+        """Return the nodes of a variable at all steps, margins included; the only node of a static variable."""
         return unrolled(name, self.local[name], self.length)
 
     def inner(self, name: str) -> list[Node]:
@@ -116,15 +121,25 @@ class Unrolled:
         return self.nodes(name)[self.margin : self.margin + self.width] or self.nodes(name)
 
     def drawn(self, order: Sequence[Block]) -> Iterator[Node]:
-        """Yield the latent nodes in drawing order; a block drawn at all steps at once is yielded forward in time."""
+        """Yield the nodes of the latents in drawing order.
+
+        The nodes of a block that is drawn at all steps at once are yielded forward in time.
+        """
         for block in order:
             for step in zip(*(self.nodes(name)[:: block.direction or 1] for name in block.names), strict=True):
                 yield from step
 
     def offsets(self, edges: Mapping[Node, Iterable[Node]], child: str, parent: str) -> np.ndarray:
-        """Return whether an inner step of the child reads the parent at each offset s - t = -(W-1), ..., W-1.
+        """Return for each offset s - t whether the child at any inner step t depends on the parent at step s.
 
-        If one of the two is static, the result has shape (1,): whether there is any edge.
+        Args:
+            edges: parent nodes of each child node.
+            child: name of the child.
+            parent: name of the parent.
+
+        Returns:
+            Bool array (2 W - 1,) for the offsets -(W-1), ..., W-1. If the child or the parent is static, the array has
+            shape (1,) and contains whether there is any edge.
         """
         rows, columns = map(self.inner, (child, parent))
         reads = np.array([[column in edges[row] for column in columns] for row in rows])
@@ -133,7 +148,15 @@ class Unrolled:
         return np.array([reads.diagonal(offset).any() for offset in range(1 - self.width, self.width)])
 
     def parent(self, child: str, name: str, offsets: np.ndarray) -> Parent:
-        """Return a parent with these offsets; a relation that includes the last offset in view is unbounded."""
+        """Return a parent that is read at these offsets.
+
+        The most distant offset of the inner steps stands for all offsets beyond it, so its relation has no bound.
+
+        Args:
+            child: name of the child.
+            name: name of the parent.
+            offsets: result of `offsets`.
+        """
         relation = ALL if self.local[name] else None
         if self.in_time(child, name):
             far = self.width - 1
@@ -152,23 +175,27 @@ def faithful_inverse(
     order: Sequence[Block] | None = None,
     summed: Iterable[str] = (),
 ) -> Factorization:
-    """Return the smallest guide that contains every dependency of the exact posterior in this drawing order.
+    """Return the smallest guide that contains every dependency of the exact posterior in a drawing order.
 
-    Every edge is necessary for exactness, with one exception. A pattern that is periodic in time (a lag of 2 without a
-    lag of 1) cannot be written in this notation. Beyond twice the sum of the model's lags for each latent, the guide
-    then reads all steps, which is more than it needs.
+    Every edge is necessary for exactness, with one exception. A dependency may be periodic in time: for example, with
+    a lag of 2 and no lag of 1, a posterior depends on every second step. The notation cannot express this for all
+    steps. The guide then reads every step beyond the distance 2 L K, which is more than it needs. L is the sum of the
+    model's different lags, and K is the number of latents.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
-        order: drawing order, such as one of `orders`. By default, static latents are first, then local ones step by
-            step forward in time, within a step in the order of the model.
+        order: drawing order of the latents, such as one of `orders`. By default, static latents are drawn first. The
+            local latents follow together, step by step forward in time, within a step in the order of the model.
         summed: names of latents that are summed out (`Discrete`), which no guide draws.
+
+    Returns:
+        The guide q.
 
     Raises:
         ValueError: an observed variable is not in the model; the order does not contain each latent once, or mixes
             static and local latents in a block; the model has a custom mask, which is known only at a given length.
-        TypeError: the order contains something else than blocks.
+        TypeError: the order contains an item that is not a `Block`.
 
     >>> print(dvae.faithful_inverse("p(z_t | z_{t-1}) p(x_t | z_t)").text)
     q(z_t | z_{t-1}, x_{>=t})
@@ -178,20 +205,24 @@ def faithful_inverse(
     latents = _latents(generative, data, summed := tuple(summed))
     order = tuple(order) if order is not None else next(iter(orders(generative, data, summed)))
     if not all(isinstance(block, Block) for block in order):
-        raise TypeError(f"an order must consist of blocks, as in dvae.factorization.inversion.orders, got {order!r}")
+        raise TypeError(
+            "`order` must contain only Block objects, like the results of dvae.factorization.inversion.orders, got "
+            f"{order!r}"
+        )
     if mixed_blocks := [b for b in order if len({generative.local(n) for n in b.names if n in latents}) > 1]:
         raise ValueError(
-            f"{describe_order(mixed_blocks)} mixes static and local latents; give static ones a separate block"
+            f"the block '{describe_order(mixed_blocks[:1])}' of the order mixes static and local latents; put static "
+            "latents in separate blocks"
         )
     if sorted(name for block in order for name in block.names) != sorted(latents):
         raise ValueError(
-            f"the order '{describe_order(order)}' must contain the latents {', '.join(latents)}, each once"
+            f"the order must contain the latents {', '.join(latents)}, each exactly once, got '{describe_order(order)}'"
         )
     relations = [p.relation for f in generative.factors for p in f.parents if p.relation is not None]
     if custom := [relation for relation in relations if relation.intervals is None]:
         raise ValueError(
-            f"{custom[0]} is a custom mask, known at a single length, but a derived guide is for every length; "
-            "write the guide, and check it at your length with audit(..., steps=T)"
+            f"the model has the custom mask {custom[0]}, which may differ between lengths, but a derived guide must "
+            "hold at every length; write the guide yourself and check it with audit(model, guide, steps=T)"
         )
     reach = sum({relation.lag for relation in relations}) * max(1, len(latents))
     names = (*latents, *data, *generative.context)
@@ -228,13 +259,16 @@ def orders(
 ) -> Iterator[Order]:
     """Yield the drawing orders of the latents: static ones first or last, the others forward or backward in time.
 
-    Several local latents are either drawn together step by step, in every order within a step, or one after the other,
-    each at all of its steps.
+    Several local latents are drawn together step by step, with every order within a step, or one after the other, each
+    at all of its steps.
 
     Args:
         generative: p, a factorization or its text.
         observed: names of the observed variables.
         summed: names of latents that are summed out, as in `faithful_inverse`.
+
+    Raises:
+        ValueError: a name in `observed` or `summed` is not a variable of the model.
 
     >>> [describe_order(order) for order in orders("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)")]
     ['w, z forward', 'w, z backward', 'z forward, w', 'z backward, w']
@@ -253,7 +287,7 @@ def orders(
 
 
 def describe_order(order: Sequence[Block]) -> str:
-    """Return an order in words."""
+    """Return a drawing order in words, such as "w, z forward"."""
     ways = {1: " forward", -1: " backward", 0: ""}
     return ", ".join(" with ".join(block.names) + ways[block.direction] for block in order)
 
@@ -272,14 +306,14 @@ def guide(
     masks: Mapping[str, Relation | MaskFunction] | None = None,
     summed: Iterable[str] = (),
 ) -> Factorization:
-    """Return the guide that an argument describes.
+    """Return the factorization of the guide that the argument `inference` of a model selects.
 
     Args:
-        generative: the model.
-        inference: a factorization or its text; "faithful" for the guide that `faithful_inverse` derives, None for the
-            prior, "" without latents.
+        generative: factorization of the model.
+        inference: a factorization or its text; "faithful" for the guide that `faithful_inverse` derives; None for the
+            prior as a guide; "" for a guide without factors, for a model without latents.
         observed: names of the observed variables.
-        masks: custom relations, as in `Factorization.parse`.
+        masks: custom relations by name, as in `Factorization.parse`.
         summed: names of latents that are summed out, as in `faithful_inverse`.
 
     Raises:

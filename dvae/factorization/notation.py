@@ -1,4 +1,6 @@
-r"""Parse equations as papers write them into factorizations: which variables a factor reads, and at which time steps.
+r"""Parse equations in the notation of papers into factorizations.
+
+A factorization states which variables each factor reads, and at which time steps:
 
     p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)
 
@@ -35,10 +37,10 @@ if TYPE_CHECKING:
 
 
 RESERVED = {
-    "lengths": "the batch's entry for the number of valid steps",
-    "log_det": "the batch's entry for the log-determinant of a view",
-    "mask": "the batch's entry for which entries are observed",
-    "sequences": "the name of the plate over the batch",
+    "lengths": "the numbers of valid steps in a batch",
+    "log_det": "the log-determinants of a view in a batch",
+    "mask": "the mask of observed entries in a batch",
+    "sequences": "the Pyro plate over the sequences of a batch",
 }
 FONT = r"\\(?:math(?:bf|rm|it|sf)|boldsymbol|bm)(?![a-z])\s*"
 
@@ -48,7 +50,13 @@ FONT = r"\\(?:math(?:bf|rm|it|sf)|boldsymbol|bm)(?![a-z])\s*"
 
 @dataclass(frozen=True)
 class Parent:
-    """A variable that a factor reads: a local variable with a relation in time, or a static variable without one."""
+    """A variable that a factor reads.
+
+    Args:
+        name: name of the variable.
+        local: True for one value per time step, False for one value per sequence (static).
+        relation: steps of the variable that are read; None for a static variable.
+    """
 
     name: str
     local: bool
@@ -56,14 +64,17 @@ class Parent:
 
     @property
     def pieces(self) -> tuple[tuple[str, str | None], ...]:
-        """Pairs (name, subscript) as written, such as `(("x", "<t"), ("x", ">t"))`; subscript None if static."""
+        """Pairs (name, subscript), such as `(("x", "<t"), ("x", ">t"))`, one for each term in the equation.
+
+        The subscript of a static variable is None.
+        """
         if self.relation is None:
             return ((self.name, None),)
         return tuple((self.name, part.name[1:-1]) for part in self.relation.parts)
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """The pieces as text: `("x_{<t}", "x_{>t}")`."""
+        """The `pieces` as text, such as `("x_{<t}", "x_{>t}")`."""
         return tuple(_plain(*piece) for piece in self.pieces)
 
     def __str__(self) -> str:
@@ -72,7 +83,14 @@ class Parent:
 
 @dataclass(frozen=True)
 class Factor:
-    """One conditional distribution of a factorization; prints as `p(z_t | z_{t-1}, w)`."""
+    """One conditional distribution of a factorization, such as `p(z_t | z_{t-1}, w)`.
+
+    Args:
+        kind: "p" in a model, "q" in a guide.
+        child: name of the variable whose distribution this is.
+        local: True if the child has one value per time step, False if it has one value per sequence (static).
+        parents: variables that the factor reads, each at most once.
+    """
 
     kind: Literal["p", "q"]
     child: str
@@ -84,23 +102,37 @@ class Factor:
         return next((parent for parent in self.parents if parent.name == name), None)
 
     def mask(self, parent: str, T: int) -> np.ndarray:
-        """Return which steps of a parent each step reads, a bool array (T or 1, T or 1), as in `Factorization.mask`."""
+        """Return which steps of a parent (columns) each step of the child (rows) reads.
+
+        Args:
+            parent: name of the parent.
+            T: number of time steps.
+
+        Returns:
+            Bool array (T or 1, T or 1): T for a local variable, 1 for a static one.
+
+        Raises:
+            ValueError: the factor does not read this variable, or a custom mask has a wrong shape or dtype.
+        """
         reads = self.parent(parent)
         if reads is None:
-            raise ValueError(f"{self} does not read {parent}")
+            raise ValueError(f"{self} does not read {parent}; it reads {_names(each.name for each in self.parents)}")
         rows, columns = T if self.local else 1, T if reads.local else 1
         if reads.relation is None or (reads.relation == ALL and not self.local):
             return np.ones((rows, columns), dtype=bool)
         mask = reads.relation.mask(T) if self.local else reads.relation.rows(T)
         if len(mask) != rows:
             raise ValueError(
-                f"the mask {reads.relation} of {self} is {mask.shape} at T={T}, but {self.child} is static: "
-                f"expected a bool array (1, {T})"
+                f"the mask {reads.relation} of {self} has the shape {mask.shape} at T={T}, but {self.child} is static; "
+                f"its function must return a single row, a bool array of shape (1, {T})"
             )
         return mask
 
     def edges(self, T: int) -> list[tuple[Node, Node]]:
-        """Return the edges (parent, child) of the graph unrolled over T steps, as in `Factorization.dag`."""
+        """Return the edges of this factor in the graph unrolled over T steps.
+
+        Each edge is a pair of nodes (parent, child). Nodes are pairs, as in `Factorization.dag`.
+        """
         edges, children = [], unrolled(self.child, self.local, T)
         for parent in self.parents:
             parents = unrolled(parent.name, parent.local, T)
@@ -108,7 +140,12 @@ class Factor:
         return edges
 
     def render(self, variable: Callable[[str, str | None], str], bar: str = " | ") -> str:
-        """Return the factor as text; `variable(name, subscript)` formats each variable."""
+        """Return the factor as text.
+
+        Args:
+            variable: function that formats a variable from its name and its subscript, which is None if static.
+            bar: text between the child and its parents.
+        """
         child = variable(self.child, "t" if self.local else None)
         conditions = ", ".join(variable(*piece) for parent in self.parents for piece in parent.pieces)
         return f"{self.kind}({child}{bar + conditions if conditions else ''})"
@@ -123,8 +160,8 @@ class Block:
 
     Args:
         names: variables in drawing order within a step.
-        direction: 0 for all steps at once (always a single variable), +1 for step by step forward in time,
-            -1 for backward.
+        direction: +1 if they are drawn step by step forward in time, -1 if backward in time. A direction of 0 is for a
+            single variable that is static or drawn at all steps at once.
     """
 
     names: tuple[str, ...]
@@ -159,15 +196,20 @@ def _html(name: str, subscript: str | None) -> str:
 class Factorization:
     """A joint distribution over sequences, as a product of conditional distributions.
 
-    Create it with `parse`. Construction checks that the variables can be drawn in some order. It raises an error, which
-    shows the cycle, if a variable reads another that is drawn after it. The written order of the factors only breaks
-    ties.
+    Create it with `parse`. Construction checks that the variables can be drawn in some order. If variables depend on
+    each other in a cycle, the error shows the cycle. The order in which the factors are written matters only if several
+    drawing orders are valid.
+
+    Args:
+        kind: "p" for a generative model, "q" for a guide.
+        factors: one factor for each variable.
 
     >>> print(dvae.Factorization.parse("p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)"))
     p(x_{1:T}, z_{1:T}, w) = p(w) ∏_t p(z_t | z_{t-1}, w) p(x_t | z_t)
 
     Raises:
-        ValueError: the factors form a cycle, one loop needs both time directions, or a custom mask is invalid.
+        ValueError: the factors form a cycle; variables in one loop over time read the future in a model, or both the
+            past and the future in a guide; or a custom mask is invalid.
     """
 
     kind: Literal["p", "q"]
@@ -198,19 +240,22 @@ class Factorization:
         if isinstance(text, Factorization):
             return text
         if not isinstance(text, str):
-            raise TypeError(f'equations are text such as "p(z_t | z_{{t-1}}) p(x_t | z_t)", got {text!r}')
+            raise TypeError(f'expected equations as text, such as "p(z_t | z_{{t-1}}) p(x_t | z_t)", got {text!r}')
         return cls(*_Reader(text, masks or {}).factorization())
 
     # variables and parents ---------------------------------------------------------------------------------
 
     @cached_property
     def variables(self) -> tuple[str, ...]:
-        """Names of the variables with a factor, in written order."""
+        """Names of the variables with a factor, in the written order of the factors."""
         return tuple(factor.child for factor in self.factors)
 
     @cached_property
     def context(self) -> tuple[str, ...]:
-        """Names that are read but have no factor, in order of appearance. In a guide they include the data."""
+        """Names of the variables that factors read but that have no factor, in order of appearance.
+
+        The context of a guide includes the data.
+        """
         parents = (parent.name for factor in self.factors for parent in factor.parents)
         return tuple(name for name in dict.fromkeys(parents) if name not in self.variables)
 
@@ -222,23 +267,25 @@ class Factorization:
         raise ValueError(f"no factor for {name!r} in {self.text!r}; there are factors for {_names(self.variables)}")
 
     def prior_guide(self, observed: Iterable[str] = ("x",)) -> Factorization:
-        """Return the prior as a guide: the factors of the latents, written as q. It has no factors without latents.
+        """Return the prior as a guide: the factors of the latents with kind q.
 
         Args:
-            observed: names of the variables to leave out: observed variables and latents that are summed out.
+            observed: names of the variables whose factors are left out: observed variables and latents that are summed
+                out. If no factors remain, the result is a guide without factors.
         """
         observed = tuple(observed)
         return Factorization("q", tuple(replace(f, kind="q") for f in self.factors if f.child not in observed))
 
     def given(self, local: Iterable[str], static: Iterable[str], but: Collection[str] = ()) -> Factorization:
-        """Return the factorization with additional context that its factors read.
+        """Return the factorization with further context variables, such as covariates, as parents of its factors.
 
-        Factors of local variables read local context at t; factors of static variables read all its steps. Static
-        variables without parents read none.
+        At step t, a factor of a local variable reads local context at t. A factor of a static variable reads local
+        context at all steps. A factor of a static variable without parents, such as p(w), stays unchanged.
 
         Args:
-            local, static: names of the context.
-            but: factors that do not read it, such as "p(z)".
+            local: names of context variables with one value per time step.
+            static: names of context variables with one value per sequence.
+            but: factors that stay unchanged, by kind and child, such as "p(z)".
         """
         factors = []
         for factor in self.factors:
@@ -252,7 +299,11 @@ class Factorization:
         return replace(self, factors=tuple(factors))
 
     def local(self, name: str) -> bool:
-        """Return True for a variable with one value per time step, False for one value per sequence."""
+        """Return True for a variable with one value per time step, False for one with one value per sequence.
+
+        Raises:
+            ValueError: the factorization does not contain this name.
+        """
         if name not in self._locality:
             raise ValueError(f"no variable {name!r} in {self.text!r}; there are {_names(self._locality)}")
         return self._locality[name]
@@ -264,13 +315,18 @@ class Factorization:
 
     @property
     def masks(self) -> dict[str, MaskFunction]:
-        """The custom masks in use: `Factorization.parse(f.text, masks=f.masks) == f`."""
+        """Functions of the custom masks in use, by name; `Factorization.parse(f.text, masks=f.masks) == f`."""
         relations = (parent.relation for factor in self.factors for parent in factor.parents)
         parts = (part for relation in relations if relation is not None for part in relation.parts)
         return {part.name[1:-1]: part.function for part in parts if part.function is not None}
 
     def mask(self, child: str, parent: str, T: int) -> np.ndarray:
         """Return which steps of the parent (columns) each step of the child (rows) may read.
+
+        Args:
+            child: name of a variable with a factor.
+            parent: name of any variable.
+            T: number of time steps.
 
         Returns:
             Bool array (T or 1, T or 1): T for a local variable, 1 for a static one. The shape is (T, T) for a local
@@ -286,8 +342,8 @@ class Factorization:
     def edges(self) -> tuple[tuple[str, Parent], ...]:
         """The dependencies (child, parent), with the past, the same step and the future as separate edges.
 
-        For q(z_t | x_{1:T}, w) the parents are x_{<t}, x_t, x_{>t} and w. A parent of a static variable is a single
-        edge, and so is a custom mask.
+        For q(z_t | x_{1:T}, w) the parents are x_{<t}, x_t, x_{>t} and w. Each parent of a static variable is a single
+        edge, and so is a parent with a custom mask.
         """
 
         def sides(factor: Factor, relation: Relation | None) -> Iterable[Relation | None]:
@@ -303,18 +359,23 @@ class Factorization:
         )
 
     def describe_edge(self, child: str, parent: Parent) -> str:
-        """Return one of the `edges` in words, such as "x_{<t} to z_t"."""
+        """Return one of the `edges`, (child, parent), in words, such as "x_{<t} to z_t"."""
         return f"{parent} to {_plain(child, 't' if self.local(child) else None)}"
 
     def without(self, child: str, parent: Parent) -> Factorization:
         """Return the factorization without one of its `edges`.
+
+        Args:
+            child: name of the child of the edge.
+            parent: parent of the edge, with the relation as in `edges`.
 
         Raises:
             ValueError: the factorization does not contain this edge.
         """
         factor = self.factor(child)
         if (child, parent) not in self.edges:
-            raise ValueError(f"{factor} has no edge from {parent}")
+            edges = _names(str(each) for name, each in self.edges if name == child)
+            raise ValueError(f"{factor} has no edge from {parent}; it has edges from {edges}")
 
         def subtract(other: Parent) -> Parent | None:
             if other.relation == parent.relation or other.relation is None or parent.relation is None:
@@ -330,11 +391,11 @@ class Factorization:
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
-        """Blocks of variables in a valid drawing order; the written order breaks ties.
+        """Blocks of variables in a valid drawing order; if several orders are valid, the written order decides.
 
         A block is a strongly connected component of the graph with an edge from v to u if u reads v at any step. Its
-        variables are drawn in one loop over time. A variable that does not depend on its own values is drawn at all
-        steps at once.
+        variables are drawn in one loop over time. A single variable that does not read its own values needs no loop: it
+        is drawn at all steps at once.
         """
         reads = nx.DiGraph()
         reads.add_nodes_from(self.variables)
@@ -370,19 +431,34 @@ class Factorization:
             names = tuple(nx.lexicographical_topological_sort(now, key=self.variables.index))
         except nx.NetworkXUnfeasible:
             factor, parent = self._blame(now)
-            late = f"drawn after {factor.child}_t" if parent.name != factor.child else "what it draws"
+            late = f"drawn after {factor.child}_t" if parent.name != factor.child else "the variable that it draws"
             raise self._undrawable(factor, parent, f"{parent.name}_t is {late}", direction) from None
         return Block(names, direction)
 
     def _blame(self, now: nx.DiGraph) -> tuple[Factor, Parent]:
-        """Choose the dependency of a cycle to report: a self-loop, else a range such as {<=t}, else the first."""
+        """Return the factor and the parent of a cycle that the error names.
+
+        A variable that reads itself at t is preferred, then a range of steps such as {<=t}, then the written order.
+
+        Args:
+            now: graph of the dependencies within a step, which contains a cycle.
+        """
         cycle = set(next(nx.simple_cycles(now)))
         edges = [(f, p) for f in self.factors for p in f.parents if {f.child, p.name} <= cycle]
         edges = [(f, p) for f, p in edges if now.has_edge(p.name, f.child)]
         return min(edges, key=lambda edge: (edge[0].child != edge[1].name, edge[1].relation == NOW))
 
     def _undrawable(self, factor: Factor, parent: Parent, reason: str, direction: int = 0) -> ValueError:
-        """Return the error: factor, parent, reason, shortest cycle and, for a local parent, the likely intention."""
+        """Return an error that names the factor, the parent, the reason and the shortest cycle.
+
+        If a direction is given and the parent is local, the error also suggests a valid relation.
+
+        Args:
+            factor: the factor that cannot be drawn.
+            parent: the parent that it reads.
+            reason: text that completes "factor reads parent, but ...".
+            direction: direction of the loop over time, +1 or -1; 0 if there is no loop.
+        """
         message = f"{factor} reads {parent}, but {reason}"
         if cycle := self._cycle(factor.child, parent.name):
             message += f" (cycle {' -> '.join(_node(*node) for node in cycle)})"
@@ -395,7 +471,10 @@ class Factorization:
         return ValueError(message)
 
     def _cycle(self, child: str, parent: str) -> list[Node]:
-        """Return the shortest unrolled cycle with child reading parent, preferably from step 2; [] without a cycle."""
+        """Return the nodes of the shortest cycle of the unrolled graph with an edge from parent to child.
+
+        Among several shortest cycles, the one closest to step 2 is returned; without a cycle, the list is empty.
+        """
         relations = [p.relation for f in self.factors for p in f.parents if p.relation is not None]
         dag = self.dag(max((11 if r.intervals is None else 3 + r.lag for r in relations), default=3))
         cycles: list[list[Node]] = []
@@ -406,6 +485,10 @@ class Factorization:
 
     def dag(self, T: int, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
         """Return the graph unrolled over T steps, with edges from parent to child.
+
+        Args:
+            T: number of time steps.
+            observed: names of the observed variables.
 
         Returns:
             networkx.DiGraph with nodes (name, t), t = 1, ..., T, and (name, None) for static variables. The node
@@ -421,12 +504,16 @@ class Factorization:
         return dag
 
     def slice(self, observed: Iterable[str] = ("x",)) -> nx.DiGraph:
-        """Return the graph of one step, with an edge from the parent to the variable at t for each of `edges`.
+        """Return the graph of one step t, with one edge from parent to child for each of `edges`.
+
+        Args:
+            observed: names of the observed variables.
 
         Returns:
             networkx.DiGraph with nodes (name, subscript), such as ("x", "<t") and ("z", "t"), and (name, None) for
-            static variables, in the order of `edges`. Node attributes are `kind`, as in `dag`, `label` in LaTeX, and
-            `side`: -1 for the past and for all steps, 0 for t, 1 for the future. The edge attribute is `edge`.
+            static variables. The node attribute `kind` is defined in `dag`, `label` is LaTeX, and `side` is -1 for the
+            past and for all steps, 0 for t, and 1 for the future. The edge attribute `edge` is the pair (child, parent)
+            of `edges`.
         """
         graph, observed = nx.DiGraph(), tuple(observed)
 
@@ -449,7 +536,7 @@ class Factorization:
 
     @property
     def text(self) -> str:
-        """The factors in written order and canonical spelling; `parse` accepts it."""
+        """The factors as text in written order and canonical spelling; `parse` reads it, given the same `masks`."""
         return " ".join(map(str, self.factors))
 
     def _joint(self, variable: Callable[[str, str | None], str], bar: str, product: str) -> str:
@@ -473,15 +560,23 @@ class Factorization:
         return f"<span>{self._joint(_html, ' | ', '∏<sub><i>t</i></sub>')}</span>"
 
     def draw(self, T: int = 3, ax: Axes | None = None, observed: Iterable[str] = ("x",)) -> Axes:
-        """Draw the graphical model unrolled over T steps, with time from left to right.
+        """Draw the graphical model unrolled over time, with time from left to right.
 
-        Latents are open circles, data shaded circles, context squares. Returns the matplotlib axes.
+        Latents are open circles, data shaded circles and context variables squares.
+
+        Args:
+            T: number of time steps.
+            ax: matplotlib axes; a new figure if None.
+            observed: names of the observed variables.
+
+        Returns:
+            The matplotlib axes.
         """
         return draw_dag(self.dag(T, observed), ax=ax)
 
 
 def unrolled(name: str, local: bool, T: int) -> list[Node]:
-    """Return the nodes of a variable over T steps."""
+    """Return the nodes of a variable in a graph of T steps: (name, 1) to (name, T), or (name, None) if static."""
     return [(name, t) for t in range(1, T + 1)] if local else [(name, None)]
 
 
@@ -497,7 +592,12 @@ def _names(names: Iterable[str]) -> str:
 
 
 class _Reader:
-    """A recursive-descent parser of the grammar above that tracks the column for error messages."""
+    """Recursive-descent parser of the module's grammar; its errors show the column.
+
+    Args:
+        text: equations.
+        masks: custom relations by name, as in `Factorization.parse`.
+    """
 
     SPACE = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad)*")
     BETWEEN = re.compile(r"(?:\s|\\[,;:! ]|\\q?quad|[*·,]|\\cdot|(?:∏|\\prod)(?:_\{t(?:=1\}\^\{?T)?\}|_t)?)*")
@@ -537,12 +637,12 @@ class _Reader:
             start = self.position
             factor = self.factor()
             if factors and factor.kind != factors[0].kind:
-                self.fail("p and q in one factorization; write the generative model and the guide separately", start)
+                self.fail("p and q in one factorization; write the generative model and the guide as two texts", start)
             if any(factor.child == other.child for other in factors):
-                self.fail(f"a second factor for {factor.child}; write one factor for each variable", start)
+                self.fail(f"{factor.child} has a second factor; write exactly one factor for each variable", start)
             factors.append(factor)
         if not factors:
-            self.fail('no factors; expected for instance "p(z_t | z_{t-1}) p(x_t | z_t)"')
+            self.fail('the text has no factors; write factors such as "p(z_t | z_{t-1}) p(x_t | z_t)"')
         return factors[0].kind, tuple(factors)
 
     def factor(self) -> Factor:
@@ -563,8 +663,8 @@ class _Reader:
                 is_relative = parent.relation not in (None, ALL) and parent.relation.intervals is not None
                 if is_relative and not child.local:
                     self.fail(
-                        f"{child.name} has one value per sequence, so {parent} has no meaning; "
-                        f"it can read {parent.name}_{{1:T}}",
+                        f"{child.name} has one value per sequence and no step t to which {parent} could refer; "
+                        f"write {parent.name}_{{1:T}}",
                         start,
                     )
                 if (previous := parents.get(parent.name)) and previous.relation and parent.relation:
@@ -573,7 +673,11 @@ class _Reader:
                 if not self.take(","):
                     break
         if not self.take(r"(?:\\right)?\)"):
-            self.fail('expected "," or ")"' if parents else 'expected "|" or ")" after the one variable of a factor')
+            self.fail(
+                'expected "," or ")"'
+                if parents
+                else 'expected "|" or ")": a factor has exactly one variable before "|"'
+            )
         return Factor(kind, child.name, child.local, tuple(parents.values()))
 
     def variable(self) -> Parent:
@@ -597,18 +701,18 @@ class _Reader:
         elif subscript := re.search(r"_(\d+|T)$", word):
             stem = word[: subscript.start()]
             self.fail(
-                f"{word} names one step; write {stem}_{{1:T}} for all steps, or {stem}{subscript[1]} if it "
-                "is a variable of its own",
+                f"{word} names one step; write {stem}_{{1:T}} for all steps, or {stem}{subscript[1]} for a separate "
+                "variable",
                 start,
             )
         if word in RESERVED:
-            self.fail(f"{word!r} is {RESERVED[word]}; choose another name", start)
+            self.fail(f"the name {word!r} is reserved for {RESERVED[word]}; choose another name", start)
         local = relation is not None
         if self.local.setdefault(word, local) != local:
             was, now = ("per step", "per sequence") if self.local[word] else ("per sequence", "per step")
             self.fail(
-                f"{word} was one value {was} before and is one {now} here; write {word}_t, {word}_{{1:T}}, "
-                f"... throughout, or {word} throughout",
+                f"{word} has one value {was} earlier in the text and one value {now} here; give it a subscript, such "
+                f"as {word}_t or {word}_{{1:T}}, everywhere or nowhere",
                 start,
             )
         return Parent(word, local, relation)
@@ -617,14 +721,14 @@ class _Reader:
         opening = self.position
         subscript = self.take(self.SUBSCRIPT)
         if subscript is None:
-            self.fail('"{" without "}"', opening)
+            self.fail('"{" without "}"; close the subscript', opening)
         inside = re.sub(FONT + r"\{([^{}]*)\}", r"\1", subscript[1])
         if inside.strip() in self.masks:
             return self.masks[inside.strip()]
         try:
             return Relation.parse(inside)
         except ValueError as error:
-            hint = f" ({', '.join(self.masks)} here)" if self.masks else ""
+            hint = f" ({', '.join(self.masks)})" if self.masks else ""
             self.fail(f"{error}{hint if 'unknown' in str(error) else ''}", opening)
 
 
@@ -651,7 +755,7 @@ def check_pair(
         Names (latents, observed, context), with latents in the guide's drawing order.
 
     Raises:
-        ValueError: the guide or `sizes` do not fit the model; the message names the variable and the correction.
+        ValueError: the guide or `sizes` do not fit the model. The message names the variable and a correction.
     """
     observed = tuple(observed)
     if generative.kind != "p" or inference.kind != "q":
@@ -662,16 +766,22 @@ def check_pair(
     latents = tuple(name for name in generative.variables if name not in (*observed, *summed))
     for name in summed:
         if name not in generative.variables or name in observed:
-            raise ValueError(f"{name} cannot be summed out, because it is not a latent of {generative.text!r}")
+            raise ValueError(
+                f"{name} cannot be summed out, because it is not a latent of {generative.text!r}; the latents are "
+                f"{_names(each for each in generative.variables if each not in observed)}"
+            )
         for factor in inference.factors:
             if name == factor.child or factor.parent(name) is not None:
                 raise ValueError(
-                    f"{factor} {'draws' if name == factor.child else 'reads'} {name}, which is summed out and "
-                    "unknown to the guide; remove it"
+                    f"{factor} {'draws' if name == factor.child else 'reads'} {name}, but a guide has no values of a "
+                    f"latent that is summed out; remove {'this factor' if name == factor.child else name}"
                 )
     for name in observed:
         if name not in generative.variables:
-            raise ValueError(f"the observed {name} has no factor in {generative.text!r}; add p({name}_t | ...)")
+            raise ValueError(
+                f"the observed variable {name} has no factor in {generative.text!r}; add p({name}_t | ...), or remove "
+                f"{name} from `observed`"
+            )
     for name in inference.variables:
         if name in observed:
             raise ValueError(f"{inference.factor(name)}: {name} is observed and not a latent; remove this factor")
@@ -684,22 +794,28 @@ def check_pair(
         if name not in inference.variables:
             add = _head("q", name, generative.local(name))
             raise ValueError(
-                f"the latent {name} has no factor in the guide; add {add}, or name {name} as observed; a discrete one "
-                f"is summed out and needs none: sizes={{{name!r}: dvae.Discrete(states)}}"
+                f"the latent {name} has no factor in the guide; add {add}, or name {name} as observed, or sum {name} "
+                f"out if it is discrete: sizes={{{name!r}: dvae.Discrete(states)}}"
             )
     everything = dict.fromkeys((*generative.variables, *generative.context, *inference.context))
     for name in everything:
         locality = {f.kind: f.local(name) for f in (generative, inference) if name in f.variables + f.context}
         if len(set(locality.values())) > 1:
             has = {kind: "per step" if local else "per sequence" for kind, local in locality.items()}
-            raise ValueError(f"{name} has one value {has['p']} in the generative model and one {has['q']} in the guide")
+            raise ValueError(
+                f"{name} has one value {has['p']} in the generative model and one value {has['q']} in the guide; write "
+                f"{name} with a subscript in both, or without one in both"
+            )
     context = tuple(name for name in everything if name not in generative.variables)
     if sizes is not None:
         if missing := [name for name in everything if name not in sizes]:
-            note = " (no factor, so read as context)" if set(missing) <= set(context) else ""
-            raise ValueError(f"sizes missing for {_names(missing)}{note}; needed are {_names(everything)}")
+            note = " (context, without a factor in the equations)" if set(missing) <= set(context) else ""
+            raise ValueError(f"sizes missing for {_names(missing)}{note}; give the sizes of {_names(everything)}")
         if unknown := [name for name in sizes if name not in everything]:
-            raise ValueError(f"sizes given for {_names(unknown)}; the equations have {_names(everything)}")
+            raise ValueError(
+                f"sizes given for {_names(unknown)}, but the equations have only {_names(everything)}; remove "
+                "them, or correct their names"
+            )
     return tuple(name for block in inference.blocks for name in block.names), observed, context
 
 

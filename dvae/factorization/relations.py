@@ -15,17 +15,19 @@ MaskFunction = Callable[[int], np.ndarray]
 
 KNOWN_RELATIONS = "t, {t-1}, {t+1}, {t-k}, {t-a:t+b}, {<t}, {<=t}, {>t}, {>=t}, {1:t}, {t:T}, {1:T}"
 FARTHER = (16, 32, 64)
-"""Further lengths, after 2 to 8, at which the direction of a custom mask is inferred; every run checks it at its own T.
+"""Lengths T, in addition to 2 to 8, at which the directions of a custom mask are inferred.
+
+Every run checks the mask again at its own T.
 """
 
 
 class NotationError(ValueError):
-    """An equation that cannot be parsed; the message shows the text with a caret under the column."""
+    """Error for an equation that cannot be parsed; the message marks the wrong column with a caret."""
 
 
 @dataclass(frozen=True)
 class Relation:
-    """Which steps s of a parent the child at step t may read: offsets s - t, or a custom mask.
+    """The steps s of a parent that the child at step t may read, as a set of offsets s - t or as a custom mask.
 
     Relations support set operations: `a | b` (union), `a & b` (intersection), `~a` (complement).
 
@@ -46,7 +48,11 @@ class Relation:
 
     @classmethod
     def of(cls, intervals: Iterable[Interval]) -> Relation:
-        """Return the relation with these offset intervals, merged, sorted and named."""
+        """Return the relation with these offsets; overlapping and adjacent intervals are merged.
+
+        Args:
+            intervals: pairs (low, high) of offsets s - t in any order, both ends included and possibly infinite.
+        """
         merged: list[Interval] = []
         for low, high in sorted(intervals):
             if merged and low <= merged[-1][1] + 1:
@@ -57,12 +63,24 @@ class Relation:
 
     @classmethod
     def custom(cls, name: str, function: MaskFunction) -> Relation:
-        """Return a custom mask, printed as `{name}`: function(T) returns a bool array (T, T)."""
+        """Return a relation with a custom mask.
+
+        Args:
+            name: spelling in an equation without braces.
+            function: custom mask, as in `Relation`.
+        """
         return cls("{" + name + "}", None, function)
 
     @classmethod
     def parse(cls, text: str) -> Relation:
-        """Return the relation of a subscript without braces; raise ValueError if it is not in the grammar."""
+        """Return the relation that a subscript denotes.
+
+        Args:
+            text: subscript without braces, such as "<t" or "t-1".
+
+        Raises:
+            ValueError: the grammar of `dvae.factorization.notation` does not contain the subscript.
+        """
         for sign, spelling in {"<=": r"\\leq?", ">=": r"\\geq?", "<": r"\\lt", ">": r"\\gt"}.items():
             text = re.sub(rf"(?:{spelling})(?![a-z])", sign, text)
         for sign, spelling in {"<=": "≤", ">=": "≥", "-": "\N{MINUS SIGN}"}.items():
@@ -84,11 +102,13 @@ class Relation:
             if interval[0] > interval[1]:
                 raise ValueError(f"the range {{{text}}} is empty; write the earlier step first: {{{high}:{low}}}")
             return cls.of([interval])
-        raise ValueError(f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and any name given in masks=")
+        raise ValueError(
+            f"unknown relation {{{text}}}; known are {KNOWN_RELATIONS}, and the names of custom masks in `masks`"
+        )
 
     @property
     def parts(self) -> tuple[Relation, ...]:
-        """Relations whose union is this one, each with a spelling as a single subscript."""
+        """Relations whose union equals this relation; each can be written as a single subscript."""
         if self.intervals is not None:
             return tuple(Relation.of([interval]) for interval in self.intervals)
         if isinstance(self.function, _Composed) and self.function.operation is np.logical_or:
@@ -97,24 +117,29 @@ class Relation:
 
     @property
     def pointwise(self) -> bool:
-        """True if it reads a fixed number of steps, such as t, {t-1} and {t-2:t}; False for custom masks."""
+        """True if the relation reads a fixed number of steps, as t, {t-1} and {t-2:t} do; False for custom masks."""
         ends = [end for interval in self.intervals or [(0, math.inf)] for end in interval]
         return all(map(math.isfinite, ends))
 
     @property
     def lag(self) -> int:
-        """The largest finite distance in the definition: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}.
+        """Largest finite bound |s - t| of the relation's intervals: 1 for {<t} and {t+1}, 3 for {t-3:t}, 0 for {1:T}.
 
         Raises:
             ValueError: the relation is a custom mask, whose lag may depend on T.
         """
         if self.intervals is None:
-            raise ValueError(f"the custom mask {self} has no lag, because it may differ between lengths")
+            raise ValueError(
+                f"the custom mask {self} has no lag, because it may differ between lengths; use its `mask(T)`"
+            )
         return max((int(abs(end)) for i in self.intervals for end in i if math.isfinite(end)), default=0)
 
     @property
     def directions(self) -> frozenset[int]:
-        """The directions it reads: -1 past, 0 same step, +1 future. Custom masks are evaluated at several lengths."""
+        """Directions in time that the relation reads: -1 for the past, 0 for the same step, +1 for the future.
+
+        The directions of a custom mask are those of its entries at several lengths.
+        """
         if self.intervals is not None:
             reads = {-1: (-math.inf, -1), 0: (0, 0), 1: (1, math.inf)}
             return frozenset(k for k, side in reads.items() if (self & Relation.of([side])).intervals)
@@ -124,21 +149,31 @@ class Relation:
         return frozenset(int(sign) for sign in np.sign(np.concatenate(offsets)))
 
     def reads(self, offset: int, T: int) -> bool:
-        """Return whether the child reads the parent at this offset for all t with t + offset within 1, ..., T."""
+        """Return whether the child reads the parent at one offset, at all steps t with 1 <= t + offset <= T.
+
+        Args:
+            offset: s - t, such as -1 for the previous step.
+            T: number of time steps.
+        """
         if self.intervals is not None:
             return any(low <= offset <= high for low, high in self.intervals)
         return bool(self.mask(T).diagonal(offset).all())
 
     def mask(self, T: int) -> np.ndarray:
-        """Return a bool array (T, T): M[t, s] is True if the child at t may read the parent at s (counted from 0).
+        """Return a bool array (T, T) with entry [t, s] True if the child at step t may read the parent at step s.
+
+        The indices t and s count from 0.
+
+        Args:
+            T: number of time steps.
 
         Raises:
-            ValueError: a custom function returns something else than a bool array (T, T) or (1, T).
+            ValueError: the function of a custom mask does not return a bool array (T, T) or (1, T).
         """
         return np.broadcast_to(self.rows(T), (T, T)).copy()
 
     def rows(self, T: int) -> np.ndarray:
-        """Return `mask`, or its single row (1, T) if a custom function returns the same row for every t."""
+        """Return `mask` (T, T), or a single row (1, T) if the function of a custom mask returns a single row."""
         if self.intervals is not None:
             offset = np.arange(T)[None, :] - np.arange(T)[:, None]
             allowed = [(low <= offset) & (offset <= high) for low, high in self.intervals or [(1, 0)]]
@@ -147,8 +182,8 @@ class Relation:
         mask = np.asarray(self.function(T))
         if mask.dtype != bool or mask.shape not in ((T, T), (1, T)):
             raise ValueError(
-                f"the mask {self.name} at T={T} is {mask.dtype} {mask.shape}; expected a bool array "
-                f"({T}, {T}) with rows t and columns s (or (1, {T}): the same row for every t)"
+                f"the mask {self.name} at T={T} has dtype {mask.dtype} and shape {mask.shape}; expected a bool array "
+                f"of shape ({T}, {T}), rows t and columns s, or (1, {T}) for the same row at every t"
             )
         return mask
 
@@ -177,7 +212,14 @@ class Relation:
 
 @dataclass(frozen=True)
 class _Composed:
-    """A logical operation on custom masks. A dataclass, so that relations built the same way compare equal."""
+    """Mask function that applies a logical operation to the masks of relations.
+
+    It is a dataclass, so that relations built by the same operations compare equal.
+
+    Args:
+        operation: numpy function of one or two bool arrays.
+        operands: relations whose masks are combined.
+    """
 
     operation: Callable[..., np.ndarray]
     operands: tuple[Relation, ...]

@@ -1,14 +1,15 @@
-"""Control: bend motions onto given paths by moving their latents and correcting their poses.
+"""Control: make motions follow given paths of joints, by moving their latents and correcting their poses.
 
 The decoder f turns latents into a motion, and e corrects its poses: x = f(z_k + s m) + e. The move m shifts the latents
 from a draw z_k, in units of the prior's scale s. Every coordinate of e is a Gaussian process over frames that is 0 in
-the first pose. `follow_paths` minimises
+the first pose. With b the lengths of the bones and b_0 their target lengths, `follow_paths` minimises
 
-    |m|^2 + e' K^-1 e / c^2 + |bone lengths / first - 1|^2 / stretch^2        where x is on the paths, exactly
+    |m|^2 + e' K^-1 e / c^2 + |b / b_0 - 1|^2 / stretch^2
 
-The minimum is the mode of a posterior whose prior is centred at each draw, so different draws give different motions.
-On the paths, e is the error of the decoder; between known frames it is interpolated smoothly. The other joints may be
-corrected too, which helps to keep the bone lengths. The size of e shows how far the motion is from the model.
+under the constraint that x is exactly on the paths where these are known. The minimum is the mode of a posterior whose
+prior is centred at each draw, so different draws give different motions. Where a path is known, e is the error of the
+decoder; between known frames, e is interpolated smoothly. The other joints may be corrected too, which helps to keep
+the bone lengths. The size of e shows how far the motion is from the model.
 
 TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351) names as a limitation that given joints miss their
 paths. This correction is our own addition.
@@ -52,12 +53,13 @@ def follow_paths(
 
     Args:
         decode: function from latents (1, ...) to motions (1, T, D) in metres.
-        latents: (S, ...), starting points.
-        scale: positive scale of the latents; broadcasts against the latents of one motion.
-        paths: (T, D) in metres.
-        known: (T, D), 1 where the path is known and 0 elsewhere.
+        latents: (S, ...) draws z_k, from which the fits of S motions start.
+        scale: positive scale s of the latents under the prior; broadcasts against the latents of one motion.
+        paths: (T, D) joint positions to follow, in metres.
+        known: (T, D), 1 where a path is known and 0 where `paths` is ignored.
         skeleton: skeleton of the poses.
-        bones: (J - 1,) target bone lengths in metres; bones of length zero are unconstrained.
+        bones: (J - 1,) target bone lengths in metres, in the order of `Skeleton.edges`; bones of length zero are
+            unconstrained.
         steps: maximum number of optimiser steps for each motion.
         progress: whether to show a progress bar.
 
@@ -68,7 +70,7 @@ def follow_paths(
         ValueError: `steps` is below 1.
     """
     if steps < 1:
-        raise ValueError(f"steps must be at least 1, got {steps}")
+        raise ValueError(f"`steps` must be at least 1, got {steps}")
     covariance = smooth_covariance(len(known))
     root = CORRECTION * torch.linalg.cholesky(covariance)
     root, white, gain = (matrix.to(latents) for matrix in (root, torch.linalg.inv(root), gains(covariance, known)))
@@ -109,7 +111,13 @@ def follow_paths(
 
 
 def smooth_covariance(frames: int) -> Tensor:
-    """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, conditioned on 0 at frame 0."""
+    """Return the covariance (T, T) of a Matern-3/2 process over frames 1 to T, given the value 0 at frame 0.
+
+    The process has variance 1 before conditioning, and the length scale `SMOOTH`.
+
+    Args:
+        frames: T, number of frames.
+    """
     frame = torch.arange(frames + 1, dtype=torch.float64)
     distance = sqrt(3) / SMOOTH * (frame[:, None] - frame).abs()
     kernel = (1 + distance) * (-distance).exp()
@@ -119,7 +127,12 @@ def smooth_covariance(frames: int) -> Tensor:
 def gains(covariance: Tensor, known: Tensor) -> Tensor:
     """Return (D, T, T) matrices that map a process to its conditional mean.
 
-    The mean of coordinate d is conditioned on the values at known[:, d]; all other values are ignored.
+    The mean of coordinate d is conditioned on its values at the frames with known[:, d] = 1; its values at all other
+    frames are ignored.
+
+    Args:
+        covariance: (T, T) covariance of the process over frames.
+        known: (T, D), 1 where a coordinate is known and 0 elsewhere.
     """
     matrices = covariance.new_zeros(known.shape[1], *covariance.shape)
     patterns, pattern = known.bool().cpu().unique(dim=1, return_inverse=True)

@@ -22,7 +22,7 @@ def is_forecasts(path: str | Path) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Forecasts:
-    """Sampled futures of windows, with the observed frames and the true futures, in metres.
+    """Sampled futures of windows of motion, with the observed frames and the true futures, in metres.
 
     Args:
         skeleton: skeleton of the poses.
@@ -61,10 +61,13 @@ class Forecasts:
             invalid_windows = invalid.any((*range(array.ndim - 4), -3, -2, -1))
             if invalid_windows.any():
                 split, clip, start = self.keys[int(invalid_windows.argmax())]
-                raise FloatingPointError(f"the {name} of clip {clip!r} ({split}), frame {start}, are NaN or infinite")
+                raise FloatingPointError(
+                    f"the {name} of the window of clip {clip!r} ({split}) from frame {start} on are NaN or infinite; "
+                    "positions must be finite, and only missing joints of observed and true frames may be NaN"
+                )
 
     def window(self, n: int, samples: int | None = None) -> Forecasts:
-        """Return the first `samples` futures, or all futures, of window n alone."""
+        """Return the forecasts of window n alone, with its first `samples` futures, or all of them if None."""
         row = slice(n, n + 1)
         future = self.forecasts[:samples, row]
         return Forecasts(self.skeleton, self.keys[row], future, self.observed[row], self.truth[row], self.emission)
@@ -116,7 +119,7 @@ class Forecasts:
                 raise ValueError("expected real numbers in forecasts, observed and truth")
             return cls(skeleton, keys, motions[0], motions[1], motions[2], str(arrays.get("emission", "")))
         except KeyError as error:
-            raise ValueError(f"{path} has no {error}: `dvae forecast` writes files with all that is needed") from error
+            raise ValueError(f"{path} has no member {error}; write it with `dvae forecast`") from error
         except (FloatingPointError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -128,7 +131,7 @@ class Imputed:
     Args:
         skeleton: skeleton of the poses.
         keys: (split, clip, first frame) of the N windows.
-        filled: (S, N, T, J, 3), observed positions, and imputed ones where joints were missing.
+        filled: (S, N, T, J, 3), S samples: observed positions, and imputed positions where joints were missing.
         observed: (N, T, J), True where a joint was observed.
         emission: same as in `Forecasts`.
     """
@@ -141,7 +144,7 @@ class Imputed:
 
     @property
     def spread(self) -> np.ndarray:
-        """Root mean square distance (N, T, J) of a joint from its mean over the samples; 0 where it was observed."""
+        """Root mean square distance (N, T, J) in metres of a joint from its mean over samples; 0 where observed."""
         variance: np.ndarray = self.filled.var(0).sum(-1)
         return np.where(self.observed, 0.0, variance**0.5)
 

@@ -1,4 +1,4 @@
-"""Read the side of the body and the word from joint names, whatever their order and spelling."""
+"""Read the side and the part of the body from joint names, in any order and spelling."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ _SIDE = (
 
 
 def readings(name: str) -> list[tuple[str, str]]:
-    """Return the possible (side, word) readings of a name, the most likely first.
+    """Return the possible readings (side, word) of a joint name, the most likely first.
 
-    The side is "l", "r" or "". For example, "lhumerus" may mean the left humerus.
+    The side is "l", "r" or "" for none. The word names the part of the body, in lower case without separators. For
+    example, "LeftUpLeg" has the reading ("l", "upleg"). "lhumerus" has two readings, ("", "lhumerus") and
+    ("l", "humerus").
     """
     name = _PREFIX.sub("", name)
     for pattern in _SIDE:
@@ -38,7 +40,13 @@ def letters(word: str) -> str:
 
 
 def sides(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the joints on the left and on the right; each of them has a counterpart on the other side."""
+    """Return the indices of the left joints and of the right joints.
+
+    Joints without a counterpart on the other side are left out.
+
+    Args:
+        names: names of all joints.
+    """
     joints_by_reading: dict[tuple[str, str], list[int]] = {}
     for joint, name in enumerate(names):
         for reading in readings(name):

@@ -27,9 +27,10 @@ from .loop import Rows, each_at, select, valid_steps
 
 @dataclass(frozen=True)
 class Attention:
-    """Attention with pointwise parents as the query; parents read over a range are keys and values under their mask.
+    """An attention network: parents at single steps form the query, parents over ranges the keys and values.
 
-    A learned start token is always visible, because a first step has no past.
+    The keys are masked as the factor declares. A learned start token is always visible, because the first step has no
+    past.
 
     Args:
         width: width of queries, keys and values.
@@ -37,8 +38,8 @@ class Attention:
         layers: number of cross-attention layers over the same tokens.
         feedforward: width of the perceptron after each attention; 0 for four times the width.
         activation: activation of the perceptrons.
-        nearest: whether the nearest visible frame of each range joins the query, so that the query depends on the
-            position in the sequence before attention.
+        nearest: whether the query also contains the visible frame nearest to t of each parent over a range. Without
+            it, the query is the same at every step if no parent is read at a single step.
         extract: extractors by parent, applied first: widths of a perceptron, or the specification of another module,
             such as `NodeGraph()`.
     """
@@ -52,7 +53,11 @@ class Attention:
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Raises:
+            ValueError: `heads` does not divide `width`, or the activation is unknown.
+        """
         return AttentionNetwork(self, inputs, local)
 
 
@@ -61,26 +66,35 @@ class SelfAttention(Attention):
     """A transformer encoder with one token per frame, from the parents in the frame and the static parents.
 
     It is for a local variable that reads parents over {1:T}; over {<=t} or {>=t} the attention is one-sided. All other
-    parents, such as the variable's own past, are attended to after the encoder, as in `Attention`, with the frame's
-    token in the query. Heads alternate between past and future: distances to the other side count four times.
+    parents, such as the variable's own past, are read after the encoder by `Attention`, with the frame's token in the
+    query. Heads alternately prefer the past and the future: in the bias of a head, distances to its other side count
+    four times.
+
+    Args:
+        width, heads, layers, feedforward, activation, nearest, extract: as in `Attention`; `layers` is the number of
+            layers of the encoder, and of the attention after it.
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SelfAttentionNetwork:  # type: ignore[override]
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
-            ValueError: no parent can be encoded.
+            ValueError: no parent of a local child is read over {1:T}, {<=t} or {>=t}, `heads` does not divide `width`,
+                or the activation is unknown.
         """
         return SelfAttentionNetwork(self, inputs, local)
 
 
 class Layer(nn.Module):
-    """One cross-attention and its perceptron, both residual, with normalisation before them."""
+    """One cross-attention and its perceptron, both with residual connections, with normalisation before them.
+
+    The stream is the sequence of vectors (B, T, W) that the layers update: queries first, features at the end.
+    """
 
     def __init__(self, spec: Attention):
         super().__init__()
         if spec.width % spec.heads:
-            raise ValueError(f"width {spec.width} is not a multiple of heads {spec.heads}")
+            raise ValueError(f"`width` must be a multiple of `heads`, got width {spec.width} and heads {spec.heads}")
         self.heads = spec.heads
         inner = spec.feedforward or 4 * spec.width
         self.norm_query = nn.LayerNorm(spec.width)
@@ -105,12 +119,18 @@ class Layer(nn.Module):
         return query.transpose(1, 2)
 
     def weights(self, stream: Tensor, keys: Tensor, bias: Tensor) -> Tensor:
-        """Return the attention weights (B, heads, T, S)."""
+        """Return the attention weights (B, heads, T, S) of the stream (B, T, W) on keys (B, heads, S, W / heads)."""
         query = self.queries(stream)
         return (query @ keys.transpose(-1, -2) / math.sqrt(query.shape[-1]) + bias).softmax(-1)
 
     def forward(self, stream: Tensor, keys: Tensor, values: Tensor, bias: Tensor) -> Tensor:
-        """Return the stream (B, T, W) after attention under an additive bias, broadcastable to (B, heads, T, S)."""
+        """Return the stream (B, T, W) after attention and perceptron.
+
+        Args:
+            stream: (B, T, W).
+            keys, values: (B, heads, S, W / heads) of S tokens.
+            bias: bias that is added to the scores; broadcasts to (B, heads, T, S).
+        """
         if stream.shape[1] == 1:  # for a single query, the fused kernel takes several times as long
             attended = self.weights(stream, keys, bias) @ values
         else:
@@ -120,14 +140,19 @@ class Layer(nn.Module):
         return stream + update
 
     def absorbed(self, columns: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return maps for `step`: queries to C numbers (heads, W / heads, C), these to values, and the bias of `out`.
+        """Return the weights for `step`, which attends to tokens without computing their keys and values.
 
         Keys and values are linear in the tokens, so queries can be applied to the tokens and a loop stores only these.
         A bias of the keys shifts all scores equally and cancels. A bias of the values is added once, since the weights
         sum to one.
 
         Args:
-            columns: (C, W) matrix from stored tokens with C numbers to tokens with W; None if C = W.
+            columns: (C, W) matrix that maps tokens as stored, with C numbers, to tokens with W numbers; None if the
+                tokens are stored themselves, C = W.
+
+        Returns:
+            Matrices (heads, W / heads, C) from queries to vectors that are multiplied by stored tokens, matrices
+            (heads, C, W / heads) from averages of stored tokens to values, and a bias (W,) that replaces that of `out`.
         """
         keys, values = self.keys_values.weight.unflatten(0, (2 * self.heads, -1)).chunk(2)
         if columns is not None:
@@ -136,7 +161,11 @@ class Layer(nn.Module):
         return keys / math.sqrt(keys.shape[1]), values.mT, bias
 
     def step(self, stream: Tensor, tokens: Tensor, bias: Tensor, absorbed: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """Run `forward` at one step: the stream (B, W) attends to tokens (B, S, C) under a bias (B, heads, S)."""
+        """Run `forward` at one step: the stream (B, W) attends to stored tokens (B, S, C) under a bias (B, heads, S).
+
+        Args:
+            absorbed: result of the method `absorbed`.
+        """
         keys, values, offset = absorbed
         query = self.query(self.norm_query(stream)).unflatten(-1, (self.heads, -1)).transpose(0, 1)
         query, tokens = (query @ keys).transpose(0, 1)[:, None], tokens[:, None]
@@ -184,7 +213,10 @@ class AttentionNetwork(Network):
         self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
 
     def bias(self, parent: Input, length: int) -> Tensor:
-        """Return (heads, T, T), or (1, 1, T) for a static child: minus slope times distance if visible, else -inf."""
+        """Return the attention bias for a parent: minus slope times distance at visible steps, -inf at others.
+
+        It is (heads, T, T); for a static child it is (1, 1, T), without distances.
+        """
         assert parent.relation is not None
         mask = visible(parent.relation, length, self.slopes.device)
         if not self.local:
@@ -226,7 +258,7 @@ class AttentionNetwork(Network):
         return weights
 
     def queries(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
-        """Return the stream (B, T, W), or (B, 1, W) for a static child."""
+        """Return the first stream, computed from the parents at single steps: (B, T, W), or (B, 1, W) if static."""
         stream = self.origin.expand(batch, length if self.local else 1, -1)
         if self.point is None:
             return stream
@@ -236,7 +268,14 @@ class AttentionNetwork(Network):
     def tokens(
         self, parents: Sequence[Input], values: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return tokens (B, 1 + T * parents, W), the start token first, and their bias for every step."""
+        """Return tokens (B, 1 + T * parents, W), the start token first, and the attention bias of every step for them.
+
+        Args:
+            parents: the parents read over ranges.
+            values: {name: features (B, T, D)}.
+            batch, length: B and T.
+            lengths: (B,) number of valid steps of each sequence, or None.
+        """
         tokens = [self.embed[parent.name](values[parent.name]) for parent in parents]
         bias = functional.pad(self.biases(parents, length, lengths), (1, 0))
         return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), bias
@@ -244,8 +283,8 @@ class AttentionNetwork(Network):
     def kept(self, name: str, values: Tensor) -> Tensor:
         """Return the stored form of a parent's values (..., D) in a loop: tokens (..., W), or a shorter form.
 
-        The shorter form is used if W is larger than D + 2. It is (..., D + 2): the values, a 1 for the bias of the
-        embedding, and an indicator of the start token.
+        The shorter form is used if only one parent is read over a range and W is larger than D + 2. It is (..., D + 2):
+        the values, a 1 for the bias of the embedding, and an indicator of the start token.
         """
         if self.narrow:
             return torch.cat([values, constant((1.0, 0.0), values).expand(*values.shape[:-1], 2)], -1)
@@ -260,7 +299,10 @@ class AttentionNetwork(Network):
         return torch.cat([embed.weight.mT, embed.bias[None], self.start_token[None]])
 
     def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
-        """Return the bias of every step to the parents' valid steps, (B or 1, heads or 1, T or 1, T * parents)."""
+        """Return the attention bias of every step for all parents, -inf at padding.
+
+        It is (B, heads, T, T * parents); B is 1 without `lengths`, and heads and T are 1 for a static child.
+        """
         empty = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
         bias = torch.cat([empty, *(self.bias(parent, length) for parent in parents)], dim=-1)[None]
         if lengths is None:
@@ -338,9 +380,10 @@ class SelfAttentionNetwork(Network):
         self.extractors = Extractors([*self.encoded, *self.statics], spec.extract, spec.activation)
         if not self.encoded:
             raise ValueError(
-                "SelfAttention encodes parents of a local variable that are read at {1:T}, {<=t} or {>=t}, but the "
-                f"parents are {', '.join(f'{p.name} at {p.relation.name}' for p in others if p.relation) or 'static'}; "
-                "use networks.Attention for this factor"
+                "SelfAttention needs a local child with a parent read at {1:T}, {<=t} or {>=t}, but the child is "
+                f"{'local' if local else 'static'} and the parents are "
+                f"{', '.join(f'{p.name} at {p.relation.name}' for p in others if p.relation) or 'static'}; use "
+                "networks.Attention for this factor"
             )
         tokens = [self.extractors.seen(parent).size for parent in (*self.encoded, *self.statics)]
         self.embed = nn.Linear(sum(tokens), spec.width)
@@ -373,7 +416,7 @@ class SelfAttentionNetwork(Network):
         return stream
 
     def bias(self, length: int) -> Tensor:
-        """Return (1, heads, T, T): minus slope times distance if visible, else -inf."""
+        """Return the attention bias (1, heads, T, T): minus slope times distance at visible frames, -inf at others."""
         relation = self.encoded[0].relation
         assert relation is not None
         mask = visible(relation, length, self.slopes.device)
@@ -387,7 +430,10 @@ class SelfAttentionNetwork(Network):
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         if missing := [p.name for p in (*self.encoded, *self.statics) if p.name not in given]:
-            raise ValueError(f"SelfAttention encodes all frames at once; it cannot be in a loop with {missing[0]}")
+            raise ValueError(
+                f"SelfAttention encodes all frames at once, but {missing[0]} would be drawn step by step; use "
+                "networks.Attention for this factor"
+            )
         encoded = self.encode(given, length, lengths)
         if self.after is None:
             return encoded.unbind(1)
@@ -411,7 +457,7 @@ def _slopes(heads: int) -> Tensor:
 
 
 def _closed(parent: Input) -> bool:
-    """Return whether two rounds of attention read the same frames as one, and each frame reads itself."""
+    """Return whether the mask is reflexive and transitive, so that several layers read no frames beyond the mask."""
     if parent.relation is None or parent.relation.intervals is None or parent.relation.pointwise:
         return False
     mask = parent.relation.mask(2 * parent.relation.lag + 6)  # long enough for two rounds of attention
@@ -419,7 +465,12 @@ def _closed(parent: Input) -> bool:
 
 
 class Cache:
-    """Tokens stored so far, (B, S, C), written in place if no gradient is needed."""
+    """Tokens stored so far in a loop, (B, S, C), written in place if no gradient is needed.
+
+    Args:
+        tokens: (B, S, C) tokens known before the loop.
+        room: number of tokens that the loop will append.
+    """
 
     def __init__(self, tokens: Tensor, room: int):
         self.tokens = tokens
@@ -438,7 +489,7 @@ class Cache:
         self.tokens = self.buffer[:, : self.tokens.shape[1] + len(tokens)]
 
     def select(self, rows: Tensor) -> Cache:
-        """Return the selected rows."""
+        """Return the cache of the batch rows with indices (N,)."""
         selected = copy.copy(self)
         if self.buffer is None:
             selected.tokens = self.tokens.index_select(0, rows)
@@ -450,7 +501,7 @@ class Cache:
 
 @dataclass
 class Attending:
-    """The state of an `AttentionNetwork` between steps."""
+    """The state of an `AttentionNetwork` between steps; live parents and tokens are those that the loop draws."""
 
     queries: Hoisted | None
     points: list[tuple[Input, int | None]]
@@ -461,7 +512,7 @@ class Attending:
     live: list[Input]
     length: int
     masks: np.ndarray
-    """(T, parents * T): live tokens that are visible at a step and not yet in the cache."""
+    """(T, parents * T), True for live tokens that are visible at a step and not yet in the cache."""
     cache: Cache
     absorbed: list[tuple[Tensor, Tensor, Tensor]]
     """Results of `Layer.absorbed` by layer, the same for all rows."""
@@ -474,14 +525,14 @@ class Attending:
     """Rows of the bias, which is not copied when rows are selected."""
 
     def select(self, rows: Tensor) -> Attending:
-        """Return the selected rows."""
+        """Return the state of the batch rows with indices (N,)."""
         selected = {name: select(getattr(self, name), rows) for name in ("queries", "cache", "extracted", "lengths")}
         masks, seen = self.masks.copy(), list(self.seen)
         rows = rows if self.rows is None else self.rows.index_select(0, rows)
         return replace(self, **selected, batch=len(rows), masks=masks, seen=seen, rows=rows)
 
     def fresh(self, t: int) -> list[int]:
-        """Return the live tokens that step t is the first to see and mark them as cached."""
+        """Return the indices of the live tokens that step t is the first to read, and mark them as cached."""
         tokens = np.flatnonzero(self.masks[t]).tolist()
         if tokens:
             self.masks[:, tokens] = False

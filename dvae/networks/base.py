@@ -1,8 +1,9 @@
-"""Base of all networks: inputs, the join of pointwise parts, and shifts in time.
+"""Base classes of all networks, and the perceptron that joins parents at single steps.
 
 A network maps the parents of one factor to features, under the masks that the factor declares. It has two forms that
-must agree. `forward` evaluates all steps at once (teacher-forced). `start` and `step` evaluate one step at a time;
-`start` computes once everything that does not depend on a variable being drawn.
+must give the same features. `forward` evaluates all steps at once, from known values of all parents (teacher-forced).
+`start` and `step` evaluate one step at a time, in a loop that draws some of the parents; `start` computes once
+everything that does not depend on these draws.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Input:
     Args:
         name: name of the parent.
         size: D, dimension of the parent.
-        relation: steps of the parent that are visible at t; None for a static parent.
+        relation: steps of the parent that the factor may read at step t; None for a static parent.
     """
 
     name: str
@@ -41,7 +42,7 @@ class Input:
 
     @property
     def lags(self) -> tuple[int, ...] | None:
-        """The visible offsets s - t if there are finitely many, otherwise None."""
+        """Offsets s - t of the steps s read at t; None for a static parent, a custom mask or an unbounded range."""
         if self.relation is None or self.relation.intervals is None:
             return None
         if any(math.isinf(end) for interval in self.relation.intervals for end in interval):
@@ -50,16 +51,16 @@ class Input:
 
 
 class Network(nn.Module):
-    """A module from parents to features under masks; its contract is described in `docs/networks.md`.
+    """A module from parents to features under masks; its contract is described in `docs/reference/networks.md`.
 
     Args:
-        inputs: the parents.
-        local: whether the child is a local variable. A static child has features (B, H) instead of (B, T, H).
+        inputs: the parents of the factor.
+        local: whether the child has a value at every step. A static child has features (B, H) instead of (B, T, H).
         features: H, number of features.
     """
 
     head: ClassVar[Any] = None
-    """Specification class of the distribution that the features parameterise, if no other can read them."""
+    """Class of the factor's distribution specification, if only this class can use the features; otherwise None."""
 
     def __init__(self, inputs: Sequence[Input], local: bool, features: int):
         super().__init__()
@@ -73,7 +74,8 @@ class Network(nn.Module):
         Args:
             parents: {name: values (B, T, D), or (B, D) for a static parent}, zero at padded steps.
             length: T, number of steps.
-            lengths: (B,) numbers of valid steps in a ragged batch; later steps are padding, which the network ignores.
+            lengths: (B,) number of valid steps of each sequence in a ragged batch; later steps are padding, which the
+                network ignores. None if all steps are valid.
 
         Returns:
             (B, T, H), or (B, H) for a static child.
@@ -81,25 +83,32 @@ class Network(nn.Module):
         raise NotImplementedError
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """Return the state before the first step of a loop, with all computations on the `given` parents done."""
+        """Return the state before the first step of a loop, with all computations on the `given` parents done.
+
+        Args:
+            given: {name: values (B, T, D) or (B, D)} of the parents that the loop does not draw.
+            batch, length: B and T.
+            lengths: as in `forward`.
+        """
         raise NotImplementedError
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         """Return the features (B, H) at step t (counted from 0) and the next state.
 
         Args:
-            state: state from `start` or the previous `step`. Steps are taken once each, in the order of the loop.
+            state: state from `start` or the previous `step`. A loop calls `step` once for each step, in its order.
             t: the step.
-            drawn: {name: values (B, D) by step} of the parents that the loop draws.
+            drawn: {name: list with the values (B, D) of each step} of the parents that the loop draws.
         """
         raise NotImplementedError
 
     def forward_chunk(
         self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
     ) -> tuple[Tensor, Any]:
-        """Return the features (B, N, H) at N steps from t on, whose parents are already known, and the next state.
+        """Return the features (B, N, H) at the steps t to t + N - 1, and the next state.
 
-        The default calls `step` N times; networks override it if they can evaluate the steps at once.
+        All values that these steps read must be known. The default calls `step` N times; networks override it if they
+        can evaluate the steps at once.
 
         Args:
             state, t, drawn: as in `step`; `drawn` may already contain the draws of these steps.
@@ -112,37 +121,39 @@ class Network(nn.Module):
         return torch.stack(features, dim=1), state
 
     def forward_last(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        """Return only the features (B, H) at the last of N steps, and the next state, with arguments as in
-        `forward_chunk`.
+        """Return the features (B, H) at the last of N steps, and the next state.
 
-        Networks override it if they can skip the earlier features.
+        The arguments are those of `forward_chunk`. Networks override the method if they can skip the earlier features.
         """
         features, state = self.forward_chunk(state, t, count, drawn)
         return features[:, -1], state
 
     def refuse_ragged(self, lengths: Tensor | None) -> None:
-        """Raise an error for padded batches, in a network whose steps all read the whole sequence."""
+        """Raise a ValueError for a ragged batch; for networks that read the whole sequence at every step."""
         if lengths is not None:
             name = type(self).__name__.removesuffix("Network")
-            raise ValueError(f"{name} outputs sequences of one length, but this batch is ragged; split it by length")
+            raise ValueError(f"{name} needs sequences of equal length, but this batch is ragged; split it by length")
 
     def select(self, state: Any, rows: Tensor) -> Any:
-        """Return the state with these rows (N,) of its batch; rows may repeat, as in `loop.select`."""
+        """Return the state for the batch rows with indices (N,), which may repeat; see `loop.select`."""
         return select(state, rows)
 
     def chain(self, state: Any) -> Chain | None:
-        """Return the loop after `start` as a `Chain` for the fused function, or None if it has another form."""
+        """Return the loop from a state of `start` as a `Chain`, or None if `distributions.chain` cannot run it."""
         return None
 
 
 class FixedLengthNetwork(Network):
-    """A network that evaluates all steps together, for sequences of equal length."""
+    """A network that computes the features of all steps at once; a loop must not draw any of its parents."""
 
     @override
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         if missing := [parent.name for parent in self.inputs if parent.name not in given]:
             name = type(self).__name__.removesuffix("Network")
-            raise ValueError(f"{name} outputs all steps at once; it cannot be in a loop with {', '.join(missing)}")
+            raise ValueError(
+                f"{name} computes all steps at once, but {', '.join(missing)} would be drawn step by step; use "
+                "another network for this factor"
+            )
         return self(given, length, lengths).unbind(1)
 
     @override
@@ -151,21 +162,26 @@ class FixedLengthNetwork(Network):
 
 
 def presence(name: str) -> str:
-    """Return the name of the mask (B, T) of the steps at which a latent exists.
+    """Return the name under which a network receives the mask (B, T) of the steps at which a latent exists.
 
-    A network finds it among its parents, unless the latent exists at all steps. At other steps the latent is integrated
-    out (`Rollout.present`), and its values must not be read.
+    The mask is missing if the latent exists at all steps. At steps with False, the latent is integrated out
+    (`Rollout.present`), and the network must not read its values.
     """
     return f"{name} is there"
 
 
 def indicator(name: str) -> str:
-    """Return the name of the mask of observed data entries, which a guide's factor reads if any are missing."""
+    """Return the name of the mask of a variable's observed entries; guides read this mask if entries are missing."""
     return f"{name} was observed"
 
 
 def share_modules(networks: Sequence[Any], *names: str) -> None:
-    """Assign the named modules of the first network to the other networks."""
+    """Replace the named modules of all other networks by those of the first network.
+
+    Args:
+        networks: networks that have these modules, with equal shapes.
+        names: names of their attributes.
+    """
     for network in networks[1:]:
         for name in names:
             setattr(network, name, getattr(networks[0], name))
@@ -175,18 +191,35 @@ class NetworkSpec(Protocol):
     """Specification of a network: a frozen dataclass with a `build` method."""
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
-        """Return the network of a factor with these parents, for a child of dimension `size`."""
+        """Return the network of a factor.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: dimension of the child.
+
+        Raises:
+            ValueError: the network does not support such a factor.
+        """
         ...
 
 
 def part(values: Tensor, lag: int | None) -> Tensor:
-    """Return a parent's values at every step: shifted by the lag, or unchanged if static."""
+    """Return values (B, T, D) of a parent at t + lag for every t; for a static parent (lag None), unchanged."""
     return values if lag is None else shift(values, lag)
 
 
 @dataclass
 class Hoisted:
-    """Results of a `Join` before a loop: base (B, T, H), weights (H, D) of live parts, and known parts."""
+    """The part of a `Join` that is computed before a loop.
+
+    Args:
+        base: (B, T, H) contribution of the known parts to the first layer, bias included; for a join without layers,
+            the concatenated known parts.
+        weights: weights (H, D) of the first layer for each live part, which is a part that the loop draws.
+        known: {index of a part: values} of the known parts.
+        rows: indices (N,) of the batch rows that are still in the loop; None for all rows.
+    """
 
     base: Tensor
     weights: list[Tensor]
@@ -195,35 +228,37 @@ class Hoisted:
 
     @property
     def like(self) -> Tensor:
-        """A tensor with the loop's batch size, which `select` may have changed, and its dtype and device."""
+        """A tensor with the current batch size, dtype and device of the loop; `select` may change the batch size."""
         return self.base if self.rows is None else self.base.new_empty(()).expand(len(self.rows), 1)
 
     def select(self, rows: Tensor) -> Hoisted:
-        """Return the selected rows, which are read from the same base."""
+        """Return the results for the batch rows with indices (N,), without a copy of the base."""
         selected = Hoisted(self.base, self.weights, self.known, rows)
         selected.steps = select(self.steps, rows)
         return selected
 
     @cached_property
     def steps(self) -> Sequence[Tensor]:
-        """The base by step.
+        """The base (B, H) of each step.
 
-        It uses unbind, because the backward pass of T index operations would write T gradients (B, T, H).
+        The property uses unbind, because the backward pass of T index operations would write T gradients (B, T, H).
         """
         return self.base.unbind(1)
 
 
 @dataclass
 class Chain:
-    """A loop in the form that `distributions.chain` runs, with one product per step on the child's last value.
+    """A loop in the form that `distributions.chain` runs: each step depends only on the child's value one step away.
 
     Args:
-        lag: offset at which the child's own value is read, one step away.
-        join: join of the parts; `hoisted` contains the contribution of the known parts.
-        before: layers on the child's value, each followed by the activation.
-        cell: for a memory that reads the child's value, the contribution (B, T, 4 W) of known inputs to the gates, and
-            the weight.
-        keep: function to call with the drawn child and the states (B, T, W) of that memory.
+        lag: offset of the child's value that a step reads: -1 in a forward loop, 1 in a backward loop.
+        join: join of the parts.
+        hoisted: contribution of the known parts to the join.
+        before: weight and bias of the layers on the child's value, each followed by the activation.
+        cell: if an LSTM reads the child's value, the contribution (B, T, 4 W) of known inputs to its gates, and the
+            weight of all other inputs; otherwise None.
+        keep: function that stores the LSTM's states for other factors; it is called with the drawn child (B, T, D) and
+            the states (B, T, W).
     """
 
     lag: int
@@ -236,6 +271,8 @@ class Chain:
 
 class Join(nn.Module):
     """A multilayer perceptron on the concatenation of parts, some of them available only step by step.
+
+    A part is the values of a parent or the states of a recurrent network.
 
     Args:
         sizes: dimension of every part.
@@ -252,7 +289,7 @@ class Join(nn.Module):
     def __init__(self, sizes: Sequence[int], widths: Sequence[int], activation: str, mean: bool = False):
         super().__init__()
         if mean and len(set(sizes)) > 1:
-            raise ValueError(f"parts must have equal sizes for a mean, got {', '.join(map(str, sizes))}")
+            raise ValueError(f"mean=True needs parts of equal size, got sizes {', '.join(map(str, sizes))}")
         self.sizes = tuple(sizes)
         self.mean = mean
         self.kind = activation
@@ -278,9 +315,9 @@ class Join(nn.Module):
         """Return the known parts' contribution to the first layer at every step, and the weights of the live parts.
 
         Args:
-            known: {index of a part: values}.
+            known: {index of a part: values (B, T, D), or (B, D) for a static part}.
             batch, length: B and T.
-            through: layer that is applied first if the join has none of its own.
+            through: linear layer that serves as the first layer if the join has no layers.
         """
         layer = self.first or through
         if layer is None:
@@ -298,7 +335,13 @@ class Join(nn.Module):
         return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in known], known)
 
     def add(self, hoisted: Hoisted, t: int | slice, live: Sequence[Tensor]) -> Tensor:
-        """Return the features (B, H) at step t, or (B, N, H) at several, from hoisted and live parts."""
+        """Return the features (B, H) at step t, or (B, N, H) at several steps, from hoisted and live parts.
+
+        Args:
+            hoisted: result of `hoist`.
+            t: the step, or a slice of N steps.
+            live: values (B, D) or (B, N, D) of the parts that were not known in `hoist`, in the order of all parts.
+        """
         first = hoisted.steps[t] if isinstance(t, int) else hoisted.base[:, t]
         if self.first is None:
             known = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=-1), strict=True))
@@ -311,7 +354,11 @@ class Join(nn.Module):
 
 
 def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:
-    """Return linear layers from widths[0] to widths[-1], each followed by the activation."""
+    """Return linear layers from widths[0] to widths[-1], each followed by the activation.
+
+    Raises:
+        ValueError: the activation is unknown, or a width is below 1.
+    """
     if activation not in ACTIVATIONS:
         raise ValueError(f"unknown activation {activation!r}; known: {', '.join(ACTIVATIONS)}")
     if min(widths) < 1:
@@ -323,7 +370,7 @@ def perceptron(widths: Sequence[int], activation: str) -> nn.Sequential:
 
 
 def aligned(parts: Sequence[Tensor]) -> list[Tensor]:
-    """Return the parts with a time axis, repeating static parts; unchanged if no part has one."""
+    """Return all parts as (B, T, D), with static parts (B, D) repeated at every step; unchanged if all are static."""
     steps = max((part.shape[1] for part in parts if part.dim() == 3), default=None)
     if steps is None:
         return list(parts)

@@ -1,7 +1,8 @@
-"""torch's recurrent networks with gradients in evaluation mode on a GPU.
+"""Recurrent networks of torch that support gradients in evaluation mode, also on a GPU.
 
-cuDNN stores what the backward pass needs only in training mode. Sampling of latents and the gradient descent of control
-and completion run in evaluation mode. Without dropout, which these classes reject, the mode has no other effect.
+cuDNN stores what the backward pass needs only in training mode. Some gradients are computed in evaluation mode, such as
+those for sampling latents, for control and for completion. These classes therefore use training mode whenever gradients
+are recorded. They reject dropout; without dropout, the mode has no other effect.
 
 On some processors, oneDNN has no LSTM in half precision. There, an LSTM under autocast runs in float32.
 """
@@ -58,7 +59,7 @@ class RNN(_Differentiable, nn.RNN):
 
 @cache
 def _runs_lstm(precision: torch.dtype, training: bool) -> bool:
-    """Return whether this processor can run an LSTM under autocast; tested once on a single entry."""
+    """Return whether this processor can run an LSTM in a precision; the test on a single entry runs once."""
     with torch.inference_mode(False), torch.set_grad_enabled(training), torch.autocast("cpu", precision):
         entry, weight, bias = (torch.zeros(shape, requires_grad=training) for shape in ((1, 1, 1), (4, 1), (4,)))
         try:

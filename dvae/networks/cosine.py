@@ -1,7 +1,7 @@
 """CosineEncoder and CosineDecoder: transformers between a sequence and the cosine coefficients of a latent sequence.
 
-Step k of the latent is coefficient k. The encoder reads a sequence y and the first step s of the output. It transforms
-to coefficients between its layers:
+Step k of the latent is coefficient k. The encoder reads a sequence y and the first step s of the output. Between its
+layers, it transforms from time to coefficients:
 
     h_t = transformer([f(y_t); g(s)] + position)        features_k = transformer(sum_t basis_{kt} h_t)
 
@@ -10,7 +10,7 @@ The decoder transforms back to time and generates a sequence as offsets from the
     o_t = transformer(f([sum_k basis_{kt} z_k; g(s)]) + position)        x_t = s + o_1 + ... + o_t
 
 All steps are computed in parallel. Source: TrajeVAE (Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351), with the
-layers of its public implementation. Difference: the decoder is initialised close to a constant sequence.
+layers of its public implementation. Unlike there, the initial decoder outputs an almost constant sequence.
 """
 
 from __future__ import annotations
@@ -48,28 +48,29 @@ def cosine_basis(
         dtype, device: dtype and device of the matrix, which is cached and shared.
 
     Returns:
-        (C, T) with orthonormal rows: `basis @ v` are the coefficients of v (T, D), and
-        `basis.T @ c` the sequence of coefficients c (C, D).
+        (C, T) with orthonormal rows: `basis @ v` returns the coefficients of a sequence v (T, D), and
+        `basis.T @ c` returns the sequence with coefficients c (C, D).
 
     Raises:
         ValueError: C is not between 1 and T.
     """
     if not 1 <= coefficients <= length:
-        raise ValueError(f"a sequence of {length} steps has 1 to {length} coefficients, not {coefficients}")
+        raise ValueError(f"`coefficients` must be from 1 to the {length} steps of the sequence, got {coefficients}")
     return torch.from_numpy(scipy.fft.idct(np.eye(coefficients, length), axis=1, norm="ortho")).to(device, dtype)
 
 
 @dataclass(frozen=True)
 class CosineEncoder:
-    """Features of each coefficient from one parent over all time, such as y_{1:T}, and one static parent.
+    """A network from one parent read at all steps, such as y_{1:T}, and a static parent, to features by coefficient.
 
     Args:
-        width: W, features of each parent; the transformers have 2 W.
+        width: W, number of features of each parent; the transformers have 2 W features.
         feedforward: hidden units of the transformer layers.
         heads: number of attention heads.
         layers: layers of each of the three transformers, one before and two after the transform to coefficients.
         dropout: dropout probability in training.
-        cosine: whether to use coefficients; if False, step t of the child is time t.
+        cosine: whether step k of the child is coefficient k; if False, nothing is transformed, and step t of the child
+            is time t.
         components: C, number of low-frequency coefficients to compute, 0 for all; features of the others are 0.
     """
 
@@ -82,61 +83,65 @@ class CosineEncoder:
     components: int = 0
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineEncoderNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
-            ValueError: the parents do not match, or the child is static.
+            ValueError: the child is static, or the parents are not those described above.
         """
         return CosineEncoderNetwork(self, inputs, local)
 
 
 @dataclass(frozen=True)
 class CosineDecoder(CosineEncoder):
-    """A sequence (B, T, D) from coefficients, a parent over time, and from its first step, a static parent of size D.
+    """A network from coefficients and a first step to a sequence (B, T, D).
 
-    Further parents over all time are concatenated after the transform back to time.
+    The coefficients are a parent over time. The first step is a static parent of size D. Further parents over time are
+    concatenated after the transform back to time.
 
     Args:
-        width: W, features of the static parent.
+        width: W, number of features of the static parent.
         components: C, number of coefficients to read; 0 for all.
         feedforward, heads, layers, dropout, cosine: as in `CosineEncoder`, for a single transformer.
-        hidden: features of each time step.
-        latent: name of the parent with the coefficients.
+        hidden: number of features of each time step.
+        latent: name of the parent that contains the coefficients.
     """
 
     hidden: int = 512
     latent: str = "z"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineDecoderNetwork:  # type: ignore[override]
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
-            ValueError: the parents do not match, or the child is static.
+            ValueError: the child is static, or the parents are not those described above.
         """
         return CosineDecoderNetwork(self, inputs, local, size)
 
 
 def _split_inputs(network: Network, spec: Any) -> tuple[list[Input], Input]:
-    """Return the parents over time and the static parent."""
+    """Return the parents over time and the single static parent; raise a ValueError if there are other parents."""
     over_time = [parent for parent in network.inputs if parent.relation is not None]
     static = [parent for parent in network.inputs if parent.relation is None]
     if not network.local or not over_time or len(static) != 1:
         descriptions = ", ".join(f"{p.name} ({'static' if p.relation is None else 'local'})" for p in network.inputs)
         raise ValueError(
-            f"{type(spec).__name__} reads parents over time and one static parent, for a local variable; it was given "
-            f"{descriptions or 'none'} for a {'local' if network.local else 'static'} one"
+            f"{type(spec).__name__} needs a local child, parents over time and exactly one static parent; the child is "
+            f"{'local' if network.local else 'static'}, and the parents are {descriptions or 'none'}"
         )
     return over_time, static[0]
 
 
 class CosineEncoderNetwork(FixedLengthNetwork):
-    """Network of `CosineEncoder`. Networks may share `over_time`, `static`, `before` and `between`."""
+    """Network of `CosineEncoder`; `share_modules` can share `over_time`, `static`, `before` and `between`."""
 
     def __init__(self, spec: CosineEncoder, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 2 * spec.width)
         (source, *others), static = _split_inputs(self, spec)
         if others or source.relation != ALL:
-            raise ValueError(f"CosineEncoder reads one parent over all time, as in y_{{1:T}}; not {self.inputs}")
+            raise ValueError(
+                "CosineEncoder needs exactly one parent over time, read at all steps as in y_{1:T}; got "
+                f"{', '.join(f'{p.name} at {p.relation and p.relation.name}' for p in (source, *others))}"
+            )
         self.spec, self.names = spec, (source.name, static.name)
         self.over_time: Any = two_layers(source.size, spec.width)
         self.static: Any = two_layers(static.size, spec.width)
@@ -147,7 +152,7 @@ class CosineEncoderNetwork(FixedLengthNetwork):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """Return the features; ragged batches are not supported."""
+        """Return the features (B, T, 2 W); raise a ValueError for a ragged batch."""
         self.refuse_ragged(lengths)
         source, static = (parents[name] for name in self.names)
         first = memoize_valid(self.static, static, None)
@@ -160,7 +165,7 @@ class CosineEncoderNetwork(FixedLengthNetwork):
 
 
 class CosineDecoderNetwork(FixedLengthNetwork):
-    """Network of `CosineDecoder`. Networks may share `static`."""
+    """Network of `CosineDecoder`; `share_modules` can share `static`."""
 
     def __init__(self, spec: CosineDecoder, inputs: Sequence[Input], local: bool, size: int):
         super().__init__(inputs, local, size)
@@ -168,8 +173,8 @@ class CosineDecoderNetwork(FixedLengthNetwork):
         sizes = {parent.name: parent.size for parent in over_time}
         if spec.latent not in sizes or static.size != size:
             raise ValueError(
-                f"CosineDecoder outputs steps of size {size} from {spec.latent}_{{1:T}} and a first step of that size; "
-                f"it was given {', '.join(f'{p.name} of size {p.size}' for p in self.inputs)}"
+                f"CosineDecoder needs the parent {spec.latent}_{{1:T}} and, as the first step, a static parent of the "
+                f"child's size {size}; got {', '.join(f'{p.name} of size {p.size}' for p in self.inputs)}"
             )
         self.spec, self.first = spec, static.name
         self.others = [name for name in sizes if name != spec.latent]
@@ -186,7 +191,7 @@ class CosineDecoderNetwork(FixedLengthNetwork):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """Return the sequence; ragged batches are not supported."""
+        """Return the sequence (B, T, D); raise a ValueError for a ragged batch."""
         self.refuse_ragged(lengths)
         first, values = parents[self.first], parents[self.spec.latent]
         components = min(self.spec.components or length, length)
@@ -206,7 +211,8 @@ class CosineDecoderNetwork(FixedLengthNetwork):
 class Dropout(nn.Dropout):
     """Dropout that, on a CPU, uses one random number for four units.
 
-    torch draws one per unit, which takes a fifth of a training step. The probability is rounded to a multiple of 2^-16.
+    torch draws one number per unit, which takes a fifth of a training step. Here, the probability is rounded to a
+    multiple of 2^-16.
     """
 
     @override
@@ -222,9 +228,9 @@ class Dropout(nn.Dropout):
 class TransformerLayer(nn.TransformerEncoderLayer):
     """A transformer encoder layer with ReLU and normalisation after each part.
 
-    It computes the same as torch's. In training, torch's layer assembles the gradients of queries, keys and values from
-    three zero tensors, and attends with dropout on a path that checks for masks. This takes another fifth of a training
-    step.
+    It computes the same as torch's layer, but is faster in training. There, torch's layer builds the gradients of
+    queries, keys and values from three zero tensors, and its attention with dropout checks for masks. Both together
+    take a fifth of a training step.
     """
 
     def __init__(self, size: int, heads: int, feedforward: int, dropout: float, **options: Any):
@@ -249,7 +255,7 @@ class TransformerLayer(nn.TransformerEncoderLayer):
 
 
 def two_layers(size: int, width: int) -> nn.Sequential:
-    """Return two layers with normalisation, applied to each step."""
+    """Return two linear layers, each followed by LayerNorm and LeakyReLU, from (..., size) to (..., width)."""
     return nn.Sequential(*_layer(size, width), *_layer(width, width))
 
 
@@ -258,7 +264,7 @@ def _layer(size: int, out: int) -> list[nn.Module]:
 
 
 def transformer(size: int, spec: CosineEncoder) -> nn.TransformerEncoder:
-    """Return a transformer encoder with normalisation after each layer and at the end."""
+    """Return a transformer encoder on (B, T, size), with normalisation after each part of a layer and at the end."""
     layer = TransformerLayer(size, spec.heads, spec.feedforward, spec.dropout, batch_first=True)
     encoder = nn.TransformerEncoder(layer, spec.layers, nn.LayerNorm(size), enable_nested_tensor=False)
     for parameter in encoder.parameters():  # torch copies one layer, so all would have the same initial weights

@@ -1,4 +1,4 @@
-"""Extractors: features of a parent at single steps, computed before a network reads it over time."""
+"""Extractors: modules that map each step of a parent to features, before a network reads the parent over time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Extract = Mapping[str, "tuple[int, ...] | ExtractorSpec"]
 
 
 class Extractors(nn.ModuleDict):
-    """The extractors of a network by parent. Their output is 0 outside the sequence.
+    """The extractors of a network, by name of the parent. Their output is 0 outside the sequence.
 
     Args:
         inputs: the network's parents.
@@ -53,21 +53,32 @@ class Extractors(nn.ModuleDict):
         return {**parents, **{n: memoize_valid(self[n], parents[n], lengths) for n in self.keys() & parents}}
 
     def start(self, length: int) -> dict[str, tuple[Any, Rows]]:
-        """Return each extractor, prepared for a loop, and storage for its features at every step."""
+        """Return {name: (extractor prepared for a loop, storage for its features at each of `length` steps)}."""
         return {n: (getattr(m, "hoisted", lambda m=m: m)(), Rows([None] * length)) for n, m in self.items()}
 
     def drawn(
         self, kept: Mapping[str, tuple[Any, Rows]], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
     ) -> dict[str, Sequence[Tensor]]:
-        """Return the draws of a loop so far with extracted features in place of values; each draw is evaluated once."""
+        """Return the draws of a loop so far with extracted features in place of values; each draw is evaluated once.
+
+        Args:
+            kept: result of `start`.
+            drawn: {name: list with the values (B, D) of each step} of the parents that the loop draws.
+            lengths: (B,) number of valid steps of each sequence, or None.
+        """
         features = {n: extend_features(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
         return {**drawn, **features}
 
 
 def share(name: str, *networks: Any) -> None:
-    """Assign one extractor of a parent to all networks, taken from the first network that has one.
+    """Share the extractor of a parent among networks.
 
-    Its output is evaluated once for all of them by `memoize`.
+    The extractor of the first network that has one replaces those of the others. Within `memoizing`, its output is
+    computed once for all networks.
+
+    Args:
+        name: name of the parent.
+        networks: networks with the attribute `extractors`.
     """
     sharing = [network.extractors for network in networks if name in network.extractors]
     for extractors in sharing[1:]:

@@ -2,8 +2,8 @@
 
     H' = tanh(BN(A H W + b))
 
-A is a free adjacency matrix over nodes, learned separately for each layer. The layers read a whole trajectory as its
-first C coefficients and output all steps together.
+A is a free adjacency matrix over nodes, learned separately for each layer. The layers read the first C cosine
+coefficients of each node's trajectory, and output all steps together.
 
 Mao, Liu, Salzmann and Li, 2019, arXiv 1908.05436 (the network); Mao, Liu and Salzmann, 2021, arXiv 2108.08422 (one
 network for every part of the nodes), with the layers of its public implementation.
@@ -30,15 +30,18 @@ from .cosine import cosine_basis
 
 @dataclass(frozen=True)
 class GraphConv:
-    """Trajectories of some nodes from those of other nodes and from static parents, which every node reads.
+    """A network from trajectories of nodes and static parents to trajectories of the child's nodes.
+
+    Every node reads all static parents. The features are the coordinates of the child.
 
     Args:
-        nodes: {name of a local variable, parents and child: its nodes}, with equal numbers of coordinates. One parent
-            contains all nodes and is the initial trajectory; other parents replace their nodes in it.
+        nodes: {name of a local variable: indices of its nodes}, for the child and all local parents. All nodes have
+            the same number of coordinates. One parent must contain all nodes. Its trajectories are the input, in which
+            the other parents replace the trajectories of their nodes.
         child: name of the child.
-        length: T, steps of every sequence.
-        coefficients: C, number of coefficients kept, at most T.
-        width: features of a node.
+        length: T, number of steps of every sequence.
+        coefficients: C, number of cosine coefficients per trajectory, at most T.
+        width: number of features of a node.
         blocks: number of residual blocks with two convolutions each.
     """
 
@@ -50,10 +53,11 @@ class GraphConv:
     blocks: int = 4
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GraphConvNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
-            ValueError: the parents or the nodes do not meet the requirements above.
+            ValueError: the child is static, a size does not match the number of nodes, no parent contains all nodes, a
+                parent is not read from its first step on at every t, or `coefficients` is not between 1 and `length`.
         """
         return GraphConvNetwork(self, inputs, local, size)
 
@@ -67,7 +71,7 @@ class GraphConvNetwork(FixedLengthNetwork):
         self.spec, self.own, self.coordinates = spec, child_nodes, size // len(child_nodes)
         if not local or size % len(child_nodes):
             raise ValueError(
-                f"GraphConv needs a local variable whose size is a multiple of its {len(child_nodes)} nodes, but "
+                f"GraphConv needs a local child whose size is a multiple of its {len(child_nodes)} nodes, but "
                 f"{spec.child} is {'local' if local else 'static'} and has size {size}"
             )
         self.trajectories: list[tuple[str, list[int], int]] = []
@@ -77,14 +81,14 @@ class GraphConvNetwork(FixedLengthNetwork):
             nodes_of_parent = list(spec.nodes.get(parent.name, ()))
             if parent.size != self.coordinates * len(nodes_of_parent):
                 raise ValueError(
-                    f"{parent.name} has size {parent.size}, but GraphConv was given its nodes {nodes_of_parent}, of "
-                    f"{self.coordinates} coordinates"
+                    f"{parent.name} has size {parent.size}, but `nodes` lists {len(nodes_of_parent)} nodes with "
+                    f"{self.coordinates} coordinates each, {nodes_of_parent}; list all nodes of {parent.name}"
                 )
             self.trajectories.append((parent.name, nodes_of_parent, _visible_steps(parent, spec.length)))
         self.trajectories.sort(key=lambda trajectory: -len(trajectory[1]))
         if not self.trajectories or sorted(self.trajectories[0][1]) != list(range(len(self.trajectories[0][1]))):
             raise ValueError(
-                "GraphConv needs a parent that contains every node, such as the history h_{1:O}; the parents are "
+                "GraphConv needs a parent whose `nodes` are all nodes, such as the history h_{1:O}; the parents are "
                 f"{', '.join(parent.name for parent in self.inputs)}"
             )
         cosine_basis(spec.length, coefficients)  # raises an error for too many coefficients
@@ -101,15 +105,19 @@ class GraphConvNetwork(FixedLengthNetwork):
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
-        """Return the coordinates for T steps as specified; ragged batches are not supported."""
+        """Return the child's coordinates (B, T, D).
+
+        Raises:
+            ValueError: the batch is ragged, T differs from the specified `length`, or a training batch has one row.
+        """
         self.refuse_ragged(lengths)
         if length != self.spec.length:
             raise ValueError(
-                f"GraphConv(length={self.spec.length}) was given {length} steps; it outputs sequences of its length"
+                f"GraphConv(length={self.spec.length}) was given {length} steps; build it with length={length}"
             )
         if self.training and len(parents[self.trajectories[0][0]]) == 1:
             raise ValueError(
-                "GraphConv normalises over the batch, so training needs more than one row; use a larger batch or "
+                "GraphConv normalises over the batch, so training needs at least 2 rows, got 1; use a larger batch or "
                 "more draws"
             )
         with torch.autocast(self.last.weight.device.type, enabled=False):  # half precision is too coarse for positions
@@ -185,14 +193,14 @@ class _Mix(Function):
 
 
 def _visible_steps(parent: Input, length: int) -> int:
-    """Return how many first steps of a parent are read; they must be the same at every step."""
+    """Return O if the first O steps of a parent are read at every step; raise a ValueError for any other mask."""
     assert parent.relation is not None
     mask = torch.as_tensor(parent.relation.mask(length))
     count = int(mask[0].sum())
     if not count or (mask != (torch.arange(length) < count)).any():
         raise ValueError(
-            f"GraphConv reads a trajectory from its first step, the same at every step, as in {parent.name}_{{1:T}}; "
-            f"not {parent.name} at {parent.relation.name}"
+            f"GraphConv needs parents that are read from their first step on, the same steps at every t, as in "
+            f"{parent.name}_{{1:T}}; {parent.name} is read at {parent.relation.name}"
         )
     return count
 
@@ -200,7 +208,7 @@ def _visible_steps(parent: Input, length: int) -> int:
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)  # a matrix created in inference mode could not be used under autograd
 def _transform(n_steps: int, length: int, coefficients: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return (C, O), which maps O visible steps to coefficients of the sequence padded with the last visible step."""
+    """Return the matrix (C, O) from O visible steps to coefficients of T steps, which repeat the last visible one."""
     basis = cosine_basis(length, coefficients)
     folded = torch.cat([basis[:, : n_steps - 1], basis[:, n_steps - 1 :].sum(1, keepdim=True)], dim=1)
     return folded.to(device, dtype)

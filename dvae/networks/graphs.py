@@ -3,9 +3,9 @@
     H' = act(A H W + b)
 
 A is a free adjacency matrix over the nodes, learned separately for each layer (Mao et al., 2019, arXiv 1908.05436).
-HiT-DVAE (Bie et al., 2022, arXiv 2204.01565) uses the first before all its factors and summarises a sequence
-with the second. Difference from the paper: frames have no batch normalisation, since the features of a sequence
-would then depend on others.
+HiT-DVAE (Bie et al., 2022, arXiv 2204.01565) applies NodeGraph to the inputs of all its factors, and summarises a
+sequence with FrameGraph. Unlike in the paper, FrameGraph has no batch normalisation, since the features of a sequence
+would then depend on the other sequences of the batch.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from .extract import Extract, Extractors
 
 @dataclass(frozen=True)
 class NodeGraph:
-    """Features of each frame: an extractor for `Attention`, `SelfAttention`, `FrameGraph` and `Recurrent`.
+    """Graph convolutions on each frame: an extractor for `Attention`, `SelfAttention`, `FrameGraph` and `Recurrent`.
 
     Args:
-        width: features of a node.
+        width: number of features of a node.
         blocks: number of residual blocks with two convolutions each.
-        coordinates: consecutive numbers per node; if the size is not a multiple, each number is a node.
+        coordinates: number of consecutive entries of a frame that form a node, such as 3 for x, y and z. If the size of
+            a frame is not a multiple of it, each entry is a node.
     """
 
     width: int = 8
@@ -40,7 +41,7 @@ class NodeGraph:
     coordinates: int = 1
 
     def build(self, size: int) -> NodeFeatures:
-        """Return the module for frames (..., size)."""
+        """Return the module that maps frames (..., size) to features (..., nodes * width)."""
         return NodeFeatures(self, size)
 
 
@@ -62,7 +63,7 @@ class NodeFeatures(nn.Module):
         return self.hoisted()(frames)
 
     def hoisted(self) -> Callable[[Tensor], Tensor]:
-        """Return `forward` with the products of weights computed, for a loop that calls it many times."""
+        """Return a faster `forward` for loops, with the products of weights computed in advance."""
         first, *others = (layer.product() for layer in (self.first, *(layer for b in self.blocks for layer in b)))
 
         def features(frames: Tensor) -> Tensor:
@@ -93,7 +94,7 @@ class NodeConvolution(nn.Module):
 
 @dataclass(frozen=True)
 class FrameGraph:
-    """Summary of a sequence for a static variable: graph convolutions over the frames of a window.
+    """A network that summarises a sequence for a static child, by graph convolutions over a window of its frames.
 
     A parent is read over {1:T}, but the graph has a fixed number of frames. In training, the window starts at a random
     step, drawn for every sequence at every evaluation; otherwise it contains the first frames. A shorter sequence
@@ -101,7 +102,7 @@ class FrameGraph:
 
     Args:
         frames: number of frames in the window. Outside training, later frames are ignored.
-        width: features of a frame.
+        width: number of features of a frame.
         blocks: number of residual blocks with two convolutions each.
         extract: extractors by parent, as in `Attention`.
     """
@@ -112,14 +113,16 @@ class FrameGraph:
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FrameGraphNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is local, or a parent is not read over {1:T}.
         """
         if local or any(p.relation != ALL for p in inputs):
+            parents = ", ".join(f"{p.name} ({p.relation.name if p.relation else 'static'})" for p in inputs)
             raise ValueError(
-                "FrameGraph sums up parents read over {1:T} for a static variable; use networks.SelfAttention or "
+                "FrameGraph needs a static child with parents read over {1:T}, but the child is "
+                f"{'local' if local else 'static'} and the parents are {parents}; use networks.SelfAttention or "
                 "networks.Attention for this factor"
             )
         return FrameGraphNetwork(self, inputs, size)

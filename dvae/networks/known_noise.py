@@ -28,7 +28,7 @@ class WithNoise:
     Use it with `distributions.KnownNoise`.
 
     Args:
-        scale: name of the parent with one standard deviation per coordinate; context at t or static.
+        scale: name of the parent with one standard deviation per coordinate, a context variable at t or a static one.
         network: specification of the network on the other parents.
 
     Example:
@@ -44,16 +44,18 @@ class WithNoise:
     network: NetworkSpec = field(default_factory=Recurrent)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WithNoiseNetwork:
-        """Return the network of a factor that reads the scale.
+        """Return the network of a factor that reads the scale, as in `NetworkSpec.build`.
 
         Raises:
-            ValueError: the factor does not read the scale at t only, has no other parents, or the sizes differ.
+            ValueError: the factor does not read the scale, reads it at other steps than t, has no other parents, or the
+                scale and the child have different sizes.
         """
         scales = [p for p in inputs if p.name == self.scale and p.size == size and p.lags in (None, (0,))]
         if not scales or (scales[0].relation is not None) != (scales[0].lags == (0,)) or len(inputs) < 2:
             raise ValueError(
-                f"WithNoise reads the scale {self.scale} of size {size} at t, such as p(x_t | z_t, {self.scale}_t), "
-                f"and other parents; the parents are {', '.join(f'{p.name} ({p.size})' for p in inputs)}"
+                f"WithNoise needs the noise scale {self.scale} of size {size}, read at t or static, and other parents, "
+                f"as in p(x_t | z_t, {self.scale}_t); the parents are "
+                f"{', '.join(f'{p.name} ({p.size})' for p in inputs)}"
             )
         inner = self.network.build([p for p in inputs if p is not scales[0]], local, size)
         return WithNoiseNetwork(inner, inputs, scales[0], local)

@@ -1,4 +1,4 @@
-"""Linear: an affine network for linear-Gaussian models, with an evidence known from `dvae.program.oracle`."""
+"""Linear: an affine network for linear-Gaussian models, whose exact evidence `dvae.program.oracle` computes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Linear:
     scale: float = 0.3
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network of a factor, as in `NetworkSpec.build`."""
         return LinearNetwork(self, inputs, local, size)
 
 
@@ -49,14 +49,21 @@ class LinearNetwork(Network):
             self.weights[parent.name] = nn.Parameter(spec.scale * torch.randn(rows, columns, size, parent.size))
 
     def mask(self, name: str, length: int) -> Tensor:
-        """Return (T or 1, S or 1), True where the parent is read; a custom mask may depend on the length."""
+        """Return the mask (T, S), True where the child at step t reads the parent at step s.
+
+        T is 1 for a static child, S is 1 for a static parent. The mask of a custom relation may depend on the length.
+        """
         relation = next(parent.relation for parent in self.inputs if parent.name == name)
         if relation is None:
             return torch.ones(1, 1, dtype=torch.bool)
         return torch.as_tensor(relation.mask(length)[: length if self.local else 1])
 
     def weight(self, name: str, length: int) -> Tensor:
-        """Return the masked weights (T or 1, S or 1, H, D) for sequences of `length` steps."""
+        """Return the masked weights (T or 1, S or 1, H, D) for sequences of `length` steps.
+
+        Raises:
+            ValueError: `length` is above the maximum number of steps.
+        """
         if length > self.steps:
             raise ValueError(f"Linear(steps={self.steps}) was given {length} steps; build it with steps={length}")
         weight: Tensor = self.weights[name][:length, :length]
@@ -66,7 +73,7 @@ class LinearNetwork(Network):
         return weight * visible(relation, length, weight.device)[: len(weight), :, None, None]
 
     def known(self, given: Mapping[str, Tensor], length: int) -> Tensor:
-        """Return the contribution of the given parents to the features (B, T, H), or (T, H) without any."""
+        """Return the bias plus the contribution of the given parents, (B, T, H), or (T, H) if no parent is given."""
         features: Tensor = self.bias[:length]
         for parent in self.inputs:
             if parent.name in given:
@@ -78,7 +85,7 @@ class LinearNetwork(Network):
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
         if not self.inputs:
-            raise ValueError("Linear needs at least one parent; leave a factor without parents to its prior")
+            raise ValueError("Linear needs at least one parent, but this factor has none; do not give it a network")
         features = self.known(parents, length)
         return features if self.local else features[:, 0]
 

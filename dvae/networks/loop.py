@@ -1,8 +1,9 @@
-"""Loops over time: draws by step, selection of batch rows, and results that are computed once.
+"""Tools for loops over time: storage of draws, selection of batch rows, and reuse of results.
 
 A particle filter repeats every sequence and, within the loop, replaces unlikely particles by copies of likely ones.
-`select` applies the same choice of rows to the states of all networks. Tensors stored for every step (hoisted work, the
-draws so far) are selected only when they are read (`Rows`). The cost per step therefore does not depend on the length.
+`select` applies the same choice of rows to the states of all networks. Tensors stored for every step, such as the draws
+so far or results computed before the loop, are selected only when they are read (`Rows`). The cost per step therefore
+does not depend on the length.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from torch.nn import functional
 
 
 class Rows(Sequence[Any]):
-    """Tensors (B, ...) or None by step, with rows selected lazily since they were written.
+    """A sequence of tensors (B, ...), one per step, whose batch rows are selected only when a step is read.
 
     Args:
-        values: tensors by step.
+        values: the tensor of each step; None for a step without a tensor so far.
     """
 
     def __init__(self, values: Sequence[Any]):
@@ -32,7 +33,7 @@ class Rows(Sequence[Any]):
         self.origin: Tensor | None = None  # composition of all moves, which selects hoisted work in one step
 
     def select(self, rows: Tensor) -> Rows:
-        """Return the same values under one more selection of rows (N,)."""
+        """Return the sequence for the batch rows with indices (N,), without copying any tensor."""
         selected = Rows(self.values)
         selected.written = list(self.written)
         selected.moves = [*self.moves, rows]
@@ -59,7 +60,7 @@ class Rows(Sequence[Any]):
 
 
 def pick(value: Tensor, rows: Tensor | None) -> Tensor:
-    """Return the rows (N,) of a tensor (B, ...), without a copy if all rows are equal."""
+    """Return the rows with indices (N,) of a tensor (B, ...), without a copy if the tensor is one expanded row."""
     if rows is None:
         return value
     if value.shape[0] == 1 or value.stride(0) == 0:
@@ -68,12 +69,12 @@ def pick(value: Tensor, rows: Tensor | None) -> Tensor:
 
 
 def select(state: Any, rows: Tensor) -> Any:
-    """Return a loop's state with these rows (N,) of its batch.
+    """Return a loop's state for the batch rows with indices (N,), which may repeat.
 
     The batch is the first dimension of tensors. Containers and dataclasses are processed recursively, except frozen
-    dataclasses, which are specifications. Lists and tuples of tensors are selected step by step when they are read. An
-    object with a `select` method uses that; a state that contains weights needs one. All other objects are shared by
-    the rows.
+    dataclasses, which are specifications. Lists and tuples of tensors are selected step by step when they are read. If
+    an object has a method `select`, it is called; a state that contains weights needs one, because weights have no
+    batch dimension. All other objects are returned unchanged.
     """
     if isinstance(state, Tensor):
         return pick(state, rows)
@@ -115,6 +116,11 @@ def memoize(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed
     """Return compute(), or its cached result for the same owner and identical input objects, within `memoizing`.
 
     Factors that share a module, such as h_t in SRNN, thus evaluate it once without a reference to each other.
+
+    Args:
+        owner: object to which the result belongs, such as the module.
+        inputs: all objects that determine the result; they are compared by identity.
+        compute: function that computes the result.
     """
     cache = _CACHE.get()
     if cache is None:
@@ -127,7 +133,12 @@ def memoize(owner: object, inputs: Sequence[Any], compute: Callable[[], Computed
 
 
 def store_result(owner: object, inputs: Sequence[Tensor | None], result: Any) -> None:
-    """Store a result for `memoize` that was computed in another way, such as within a loop."""
+    """Store a result that was computed in another way, such as within a loop, so that `memoize` returns it.
+
+    Args:
+        owner, inputs: as in `memoize`.
+        result: the result.
+    """
     cache = _CACHE.get()
     if cache is not None:
         cache[_key(owner, inputs)] = (inputs, result)
@@ -138,7 +149,7 @@ def _key(owner: object, inputs: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def shift(values: Tensor, lag: int) -> Tensor:
-    """Return values[:, t + lag] at every t of (B, T, D), zero if t + lag is outside."""
+    """Return values[:, t + lag] for every step t of values (B, T, D), zero where t + lag is outside the sequence."""
     if lag == 0:
         return values
     steps = values.shape[1]
@@ -148,27 +159,30 @@ def shift(values: Tensor, lag: int) -> Tensor:
 
 
 def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
-    """Return values[t] of a loop's draws, zero outside the sequence; `like` is any (B, ...) tensor."""
+    """Return the draw (B, size) of a loop at step t, zero outside the sequence; `like` is any (B, ...) tensor."""
     return values[t] if 0 <= t < len(values) else like.new_zeros(like.shape[0], size)
 
 
 def each_at(drawn: Mapping[str, Sequence[Tensor]], parents: Sequence[Any], t: int, like: Tensor) -> list[Tensor]:
-    """Return the draws at step t + lag of each (parent, lag), a `base.Input` and a lag; a lag of None is skipped."""
+    """Return the draws (B, D) at step t + lag for each pair (parent, lag) of a `base.Input` and its lag.
+
+    Static parents, whose lag is None, are skipped.
+    """
     return [at(drawn[parent.name], t + lag, like, parent.size) for parent, lag in parents if lag is not None]
 
 
 def stack_steps(values: Sequence[Tensor], t: int, count: int, like: Tensor, size: int) -> Tensor:
-    """Return (B, N, D) of a loop's draws at N steps from t on, with `at` for each step."""
+    """Return the draws (B, N, D) of a loop at the N = `count` steps from t on, each as returned by `at`."""
     return torch.stack([at(values, s, like, size) for s in range(t, t + count)], dim=1)
 
 
 def valid_steps(lengths: Tensor, length: int) -> Tensor:
-    """Return (B, T), True at the valid steps of a ragged batch."""
+    """Return the mask (B, T), True at the first lengths[b] steps of each sequence b of a ragged batch."""
     return torch.arange(length, device=lengths.device) < lengths[:, None]
 
 
 def repeat_batch(values: Tensor, n: int) -> Tensor:
-    """Repeat all rows n times, (n B, ...); `memoize_valid` then computes features of the original rows only."""
+    """Repeat a batch (B, ...) n times, (n B, ...); `memoize_valid` then computes features of the B rows only."""
     repeated = values.repeat(n, *[1] * (values.dim() - 1))
     store_result(repeat_batch, [repeated], (values, n))
     return repeated
@@ -187,7 +201,15 @@ def join_steps(steps: Sequence[Tensor]) -> Tensor:
 
 
 def memoize_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> Tensor:
-    """Return the module's features of (B, T, D) or (B, D), 0 at padding; computed once for identical values."""
+    """Return the module's features of values (B, T, D) or (B, D), 0 at padding.
+
+    Within `memoizing`, they are computed once for the same tensor object.
+
+    Args:
+        module: module from (..., D) to (..., H).
+        values: the values.
+        lengths: (B,) number of valid steps of each sequence; None if there is no padding.
+    """
 
     def compute() -> Tensor:
         first, n = memoize(repeat_batch, [values], lambda: (values, 1))
@@ -208,13 +230,16 @@ def extend_features(
     lengths: Tensor | None,
     change: Callable[[Tensor], Tensor] | None = None,
 ) -> Rows:
-    """Add the module's output for new draws (B, D) of a loop, 0 at padding; computed once for identical draws.
+    """Store the module's outputs for new draws (B, D) of a loop, 0 at padding, and return all outputs.
+
+    Within `memoizing`, outputs are computed once for the same tensor objects.
 
     Args:
-        rows: outputs by step, which are extended.
-        drawn: draws by step; None if not drawn yet.
+        rows: output of each step, which is extended in place; None for a step without an output.
+        drawn: draw of each step; None for a step that is not drawn yet.
         module, lengths: as in `memoize_valid`.
-        change: version of the module for single steps, with computations shared by all steps already done.
+        change: version of the module for single steps, with computations shared by all steps already done; None for
+            the module itself.
     """
     draws = drawn.values if isinstance(drawn, Rows) else drawn
     fresh = [

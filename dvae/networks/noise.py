@@ -6,7 +6,7 @@ arXiv 1908.00733) therefore perturbs the code at random indices, which are drawn
 
 | | code | from (arXiv) |
 |---|---|---|
-| `MixAndMatch` | at random indices, a network of h there and z elsewhere; h at the other indices | 1908.00733 |
+| `MixAndMatch` | h; at random indices, a network's output instead, which reads h there and z elsewhere | 1908.00733 |
 | `Concatenate` | a network of [h, z] | MT-VAE: Yan et al. 2018, 1808.04545 |
 | `AddProjected` | h + W z; z has no encoder and is drawn from its prior | HP-GAN: Barsoum et al. 2018, 1711.09561 |
 
@@ -28,10 +28,11 @@ from ..distributions.subset import Subset
 
 
 class Residual(nn.Module):
-    """A linear layer in parallel with three others, two of half the width that are followed by ReLUs.
+    """The sum of a linear layer and of a perceptron with two hidden layers of half the width and ReLUs.
 
     Args:
-        size, features: numbers of inputs and outputs.
+        size: number of inputs.
+        features: number of outputs.
     """
 
     def __init__(self, size: int, features: int) -> None:
@@ -49,9 +50,13 @@ class Residual(nn.Module):
 
 
 class CodeDecoder(nn.Module):
-    """Two layers on a code (B, L) with batch normalisation between them; the output has the range of a recurrent state.
+    """Two layers on a code (B, L) with batch normalisation between them, and outputs in (-1, 1) like recurrent states.
 
-    In evaluation, and for a single row, it uses the training statistics, so rows do not depend on each other.
+    In evaluation, and for a single row, it normalises by the running averages of training. Rows then do not depend on
+    each other.
+
+    Args:
+        width: L, size of the code.
     """
 
     def __init__(self, width: int) -> None:
@@ -70,15 +75,15 @@ class CodeDecoder(nn.Module):
 class MixAndMatch:
     """Replace the code at random indices by the output of a network that reads the code there and z elsewhere.
 
-    A share alpha of the code is perturbed and the rest is unchanged; with alpha 0 the code depends only on the past.
-    For a code of L numbers, z has L - ceil(alpha L) numbers, which fill the other indices. A layer maps z of another
-    size to the code. With alpha = 1 there are no indices for z.
+    A share alpha of the code is perturbed and the rest is unchanged. For a code of L numbers, z has L - ceil(alpha L)
+    numbers, which fill the indices that are not drawn. If z has another size, a linear layer maps it to L numbers. With
+    alpha 0 or 1, the code does not depend on z: no index is perturbed, or no index is left for z.
 
     The guide reads the code of the past at the drawn indices and the code of the future at the others. All modules use
     the same indices, which are drawn once per batch: `DynamicalVAE(shared={"i": noise.indices})`.
 
     Args:
-        alpha: share of the indices, from 0 to 1.
+        alpha: share of perturbed indices, from 0 to 1.
     """
 
     indices_name: ClassVar[str] = "i"
@@ -90,19 +95,19 @@ class MixAndMatch:
 
     @property
     def indices(self) -> Subset:
-        """The distribution of the drawn indices, (L,) of ones and zeros."""
+        """The distribution of the mask (L,), 1 at the perturbed indices and 0 elsewhere."""
         return Subset(self.alpha)
 
     def latent(self, width: int) -> int:
-        """Return the size of z in the paper."""
+        """Return the paper's size of z for a code of L = `width` numbers: L - ceil(alpha L), at least 1."""
         return max(width - self.indices.chosen(width), 1)
 
     def encoder(self, width: int) -> nn.Module:
-        """Return the module for the guide's features."""
+        """Return the module from past code, future code (B, L) and indices (B, L) to the guide's features (B, L)."""
         return _MixedEncoder(width)
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """Return the module for the initial code of the future."""
+        """Return the module from past code, z (B, `latent`) and indices to the decoder's initial code (B, L)."""
         return _MixedDecoder(width, latent, self.indices.chosen(width))
 
 
@@ -128,7 +133,7 @@ class _MixedDecoder(nn.Module):
     def forward(self, past: Tensor, z: Tensor, indices: Tensor | None = None) -> Tensor:
         indices = _require_indices(indices)
         if z.shape[-1] != self.latent:
-            raise ValueError(f"z has {z.shape[-1]} numbers, but this code was built for {self.latent}")
+            raise ValueError(f"z must have size {self.latent} in its last dimension, got {z.shape[-1]}")
         latent_code = _scatter_in_order(z, indices < 0.5) if self.layer is None else functional.relu(self.layer(z))
         mixture, code = indices * past + (1 - indices) * latent_code, past
         if self.block is not None:
@@ -139,12 +144,12 @@ class _MixedDecoder(nn.Module):
 
 def _require_indices(indices: Tensor | None) -> Tensor:
     if indices is None:
-        raise ValueError("Mix-and-Match needs the indices to perturb; give them as (B, L) ones and zeros")
+        raise ValueError("Mix-and-Match needs the indices to perturb, got None; pass a (B, L) mask of ones and zeros")
     return indices
 
 
 def _scatter_in_order(values: Tensor, mask: Tensor) -> Tensor:
-    """Return (B, L) with values (B, n) placed in order at the n marked positions of `places` (B, L)."""
+    """Return (B, L) with values (B, n) in order at the n True positions of `mask` (B, L), and any numbers elsewhere."""
     order = (mask.cumsum(-1) - 1).clamp(0, values.shape[-1] - 1)
     return values.gather(-1, order)
 
@@ -156,18 +161,18 @@ def half(width: int) -> int:
 
 @dataclass(frozen=True)
 class Concatenate:
-    """A network on the concatenation of the code and z."""
+    """Replace the code of the past by the output of a network that reads the concatenated code and z."""
 
     def latent(self, width: int) -> int:
         """Return half the size of the code."""
         return half(width)
 
     def encoder(self, width: int) -> nn.Module:
-        """Return the module for the guide's features."""
+        """Return the module from past code and future code (B, L) to the guide's features (B, L)."""
         return _Concatenated(2 * width, width)
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """Return the module for the initial code of the future."""
+        """Return the module from past code (B, L) and z (B, `latent`) to the decoder's initial code (B, L)."""
         return _Concatenated(width + latent, width, CodeDecoder(width))
 
 
@@ -183,7 +188,7 @@ class _Concatenated(nn.Module):
 
 @dataclass(frozen=True)
 class AddProjected:
-    """The code plus a linear layer of z, without an encoder: the guide is the prior."""
+    """Add a linear map of z to the code of the past. There is no encoder, because the guide is the prior."""
 
     def latent(self, width: int) -> int:
         """Return half the size of the code."""
@@ -193,7 +198,7 @@ class AddProjected:
         """Return None, because the guide is the prior."""
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """Return the module for the initial code of the future."""
+        """Return the module from past code (B, L) and z (B, `latent`) to the decoder's initial code (B, L)."""
         return _ProjectedSum(width, latent)
 
 
@@ -208,13 +213,16 @@ class _ProjectedSum(nn.Module):
 
 
 class Noise(Protocol):
-    """Specification of how noise enters a code: a frozen dataclass such as those in this module."""
+    """Specification of how a latent z enters a code: a frozen dataclass, such as those in this module."""
 
     def latent(self, width: int) -> int:
         """Return the default size of z for a code of this width."""
 
     def encoder(self, width: int) -> nn.Module | None:
-        """Return the module from past code, future code and indices to the guide's features; None for the prior."""
+        """Return the module from past code, future code and indices to the guide's features.
+
+        None means that the guide is the prior.
+        """
 
     def decoder(self, width: int, latent: int) -> nn.Module:
-        """Return the module from the code of the past, z and the drawn indices to the initial code of the future."""
+        """Return the module from past code (B, L), z (B, `latent`) and indices to the decoder's initial code (B, L)."""

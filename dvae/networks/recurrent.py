@@ -23,30 +23,30 @@ CELLS: dict[str, type[GRU] | type[LSTM]] = {"gru": GRU, "lstm": LSTM}
 
 @dataclass(frozen=True)
 class Recurrent:
-    """A forward network for parents read over the past, and a backward network for parents read over the future.
+    """A recurrent network forward in time for parents read over the past, and one backward for parents of the future.
 
     A parent read over {1:T} enters both, each frame once: frames before t enter the forward network, the others the
-    backward network. The forward states of a guide can therefore be those of the generative model.
+    backward network. A guide can therefore share its forward network with the generative model (`tie`).
 
-    Parents at single steps and static parents are joined afterwards. All parents with a past share one forward state,
-    as in VRNN, where h_t summarises x and z together.
+    A perceptron then reads the states, the parents at single steps and the static parents. All parents with a past
+    share one forward state, as in VRNN, where h_t summarises x and z together.
 
     Args:
         width: width of the recurrent states.
-        cell: "lstm" or "gru"; on a CPU, torch trains an LSTM 2.4 times as fast.
+        cell: "lstm" or "gru"; on a CPU, torch trains an LSTM 2.4 times as fast as a GRU.
         layers: layers of each recurrent network.
         embed: width of a dense layer on the input of the recurrent networks; 0 for none.
-        hidden: widths of the perceptron on the states and the pointwise parents; with () the features are their
-            concatenation.
+        hidden: widths of the perceptron on the states, the parents at single steps and the static parents; with () the
+            features are the concatenation of these.
         activation: "tanh", "relu", "gelu" or "elu".
         extract: extractors by parent, applied first: widths of a perceptron, or the specification of another module,
             such as `NodeGraph()`. Their output is 0 outside the sequence.
         separate: whether each parent has its own forward and backward state.
-        join_current: whether a parent read over {<=t} enters the forward network up to t-1 only and joins with its
-            value at t.
-        stack: whether the backward network also reads the forward states and only its states are joined; requires
-            parents read over {1:T}.
-        mean: whether to average the states and pointwise parents instead of concatenating them.
+        join_current: whether, of a parent read over {<=t}, the forward network reads only steps up to t-1, and the
+            perceptron reads the value at t.
+        stack: whether the backward network also reads the forward states, and the perceptron reads only the backward
+            states; every parent with a past must then be read over {1:T}.
+        mean: whether to average the inputs of the perceptron instead of concatenating them; they need equal sizes.
     """
 
     width: int = 64
@@ -62,12 +62,16 @@ class Recurrent:
     mean: bool = False
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> RecurrentNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Raises:
+            ValueError: an option is invalid, the parents do not match `stack` or `mean`, or a parent has a custom mask.
+        """
         if self.cell not in CELLS:
             raise ValueError(f"unknown cell {self.cell!r}; known: {', '.join(CELLS)}")
         if self.width < 1 or self.layers < 1:
             raise ValueError(
-                f"a recurrent network needs width and layers of at least 1, got {self.width} and {self.layers}"
+                f"`width` and `layers` of a recurrent network must be at least 1, got {self.width} and {self.layers}"
             )
         return RecurrentNetwork(self, inputs, local)
 
@@ -76,9 +80,10 @@ class Memory(nn.Module):
     """A recurrent network over one direction of time, evaluated at all steps at once or step by step.
 
     Args:
+        spec: sizes and cell of the network.
         entries: pairs (parent, lag); at step t the network reads the parent at t + lag.
         direction: +1 forward, -1 backward in time.
-        under: a memory whose states are further inputs, placed before the entries.
+        under: memory whose states are also inputs, concatenated before the parents; None for no such inputs.
     """
 
     def __init__(
@@ -107,7 +112,7 @@ class Memory(nn.Module):
         return memoize(self, self.key(keys, lengths), lambda: self._states(values, keys, lengths))
 
     def key(self, keys: Mapping[str, Tensor], lengths: Tensor | None) -> list[Tensor | None]:
-        """Return the inputs that determine the states."""
+        """Return the tensors that determine the states, as the key under which `memoize` stores these."""
         return [*(keys[parent.name] for parent, _ in self.entries), lengths]
 
     def _states(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
@@ -124,7 +129,13 @@ class Memory(nn.Module):
         return reverse(states, lengths) if self.direction < 0 else states
 
     def start(self, given: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> MemoryState:
-        """Return the state before the first step, with the first products of the given parents computed."""
+        """Return the state before the first step, with the first layer already applied to the given parents.
+
+        Args:
+            given: {name: features (B, T, D)} of the parents that the loop does not draw.
+            batch: B, number of sequences.
+            lengths: (B,) number of valid steps of each sequence, or None.
+        """
         first = self.embed[0] if self.embed is not None else self.layers[0]
         weight, bias = (first.weight, first.bias) if self.embed is not None else (first.weight_ih_l0, first.bias_ih_l0)
         columns = weight.split([parent.size for parent, _ in self.entries], dim=1)
@@ -145,7 +156,13 @@ class Memory(nn.Module):
         )
 
     def step(self, state: MemoryState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
-        """Return the state (B, W) at t; `state` is advanced in place."""
+        """Return the state (B, W) at step t; `state` is advanced in place.
+
+        Args:
+            state: state from `start`, after the steps before t in the order of the loop.
+            t: the step, counted from 0.
+            drawn: {name: list with the features (B, D) of each step} of the parents that the loop draws.
+        """
         value = state.steps[t if len(state.steps) > 1 else 0]
         for parent, lag, weight in state.live:
             value = torch.addmm(value, at(drawn[parent.name], t + lag, value, parent.size), weight)
@@ -182,7 +199,10 @@ class Memory(nn.Module):
         return value
 
     def gates(self, state: MemoryState, length: int) -> tuple[Tensor, Tensor] | None:
-        """Return known inputs' contribution (B, T, 4 W) to an LSTM's gates and its weight; None for other networks."""
+        """Return the arguments `cell` of `distributions.chain`, or None if the memory is not a single LSTM layer.
+
+        They are the contribution (B, T, 4 W) of the given inputs to the gates, and the weight of all other inputs.
+        """
         if self.embed is not None or len(self.layers) > 1 or self.cell is not lstm_cell:
             return None
         (layer,) = self.layers
@@ -192,7 +212,14 @@ class Memory(nn.Module):
 
 @dataclass
 class MemoryState:
-    """The state of a `Memory` between steps: hoisted products, live parents and hidden states by layer."""
+    """The state of a `Memory` between steps of a loop.
+
+    Args:
+        base: (B, T, H), or (B, 1, H) for all steps, contribution of the given parents to the first layer.
+        live: parents that the loop draws, their lags and their weights (D, H) in the first layer.
+        lengths: (B,) number of valid steps of each sequence, or None.
+        hidden: states (B, W) of each layer: h and the cell for an LSTM, h twice for a GRU.
+    """
 
     base: Tensor
     live: list[tuple[Input, int, Tensor]]
@@ -201,18 +228,24 @@ class MemoryState:
 
     @cached_property
     def steps(self) -> Sequence[Tensor]:
-        """The base by step, or a single one for all steps."""
+        """The base (B, H) of each step, or a single base for all steps."""
         return self.base.unbind(1)
 
     def select(self, rows: Tensor) -> MemoryState:
-        """Return the selected rows; the base is unchanged."""
+        """Return the state of the batch rows with indices (N,), without a copy of the base."""
         selected = MemoryState(self.base, self.live, select(self.lengths, rows), select(self.hidden, rows))
         selected.steps = select(self.steps, rows)
         return selected
 
 
 def gru_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[Tensor, Tensor]:
-    """Run a step of torch.nn.GRU from the input's product W x + b (B, 3 W)."""
+    """Run one step of torch.nn.GRU and return the new state h (B, W), twice.
+
+    Args:
+        gates: (B, 3 W) contribution of the input, with bias, to the gates.
+        hidden: the last state h, twice.
+        layer: `torch.nn.GRU` with one layer, which has the recurrent weights.
+    """
     h = hidden[0]
     width = h.shape[1]
     recurrent = functional.linear(h, layer.weight_hh_l0, layer.bias_hh_l0)
@@ -223,7 +256,13 @@ def gru_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[
 
 
 def lstm_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple[Tensor, Tensor]:
-    """Run a step of torch.nn.LSTM from the input's product W x + b (B, 4 W)."""
+    """Run one step of torch.nn.LSTM and return the new state h and the new cell, (B, W) each.
+
+    Args:
+        gates: (B, 4 W) contribution of the input, with bias, to the gates.
+        hidden: the last state h and the last cell.
+        layer: `torch.nn.LSTM` with one layer, which has the recurrent weights.
+    """
     h, cell = hidden
     entry, forget, candidate, output = torch.addmm(gates + layer.bias_hh_l0, h, layer.weight_hh_l0.t()).chunk(4, 1)
     cell = torch.sigmoid(forget) * cell + torch.sigmoid(entry) * torch.tanh(candidate)
@@ -262,7 +301,10 @@ class RecurrentNetwork(Network):
         if spec.stack and (
             not past or {parent for parent, _ in past} != {parent for parent, _ in future} or spec.separate
         ):
-            raise ValueError("Recurrent(stack=True) needs parents that are all read over {1:T}, and separate=False")
+            raise ValueError(
+                "Recurrent(stack=True) needs separate=False, and every parent with a past or future must be read over "
+                "{1:T}; change these, or use stack=False"
+            )
         pasts = [Memory(spec, entries, +1) for entries in _groups(past, spec.separate)]
         under = pasts[0] if spec.stack else None
         futures = [Memory(spec, entries, -1, under) for entries in _groups(future, spec.separate)]
@@ -353,12 +395,12 @@ class RecurrentState:
     """The state of a `RecurrentNetwork` between steps.
 
     Args:
-        hoisted: contribution of the known parts to the join.
+        hoisted: contribution of the given parents to the perceptron.
         memories: memories that read drawn variables, and their states.
-        live: pointwise parents that are drawn, and their lags.
-        extracted: {name: output of the extractor for the draws so far}.
-        given: the known parents.
-        lengths: (B,) numbers of valid steps in a ragged batch.
+        live: parents at single steps that the loop draws, and their lags.
+        extracted: {name: (extractor, its output for the draws so far)}.
+        given: {name: values} of the parents that the loop does not draw.
+        lengths: (B,) number of valid steps of each sequence, or None.
     """
 
     hoisted: Hoisted
@@ -369,15 +411,20 @@ class RecurrentState:
     lengths: Tensor | None
 
     def select(self, rows: Tensor) -> RecurrentState:
-        """Return the selected rows; the known parents are unchanged."""
+        """Return the state of the batch rows with indices (N,); the given parents are unchanged."""
         selected = {name: select(getattr(self, name), rows) for name in ("hoisted", "memories", "extracted", "lengths")}
         return replace(self, **selected)
 
 
 def tie(first: Any, *others: Any) -> None:
-    """Assign the forward memory of the first network, and its extractors, to other recurrent networks.
+    """Replace the forward memory of other recurrent networks, and its extractors, by those of the first network.
 
-    All memories must read the same parents at the same lags. Shared states are evaluated once for all networks.
+    All forward memories must read the same parents at the same lags. Within `loop.memoizing`, their states are computed
+    once for all networks.
+
+    Args:
+        first: network whose forward memory is shared.
+        others: networks that use it from now on.
 
     Raises:
         ValueError: a network has no single forward memory, or the memories differ in parents, lags or parameter shapes.
@@ -385,7 +432,10 @@ def tie(first: Any, *others: Any) -> None:
     shape = _shape(first)
     for other in others:
         if (other_shape := _shape(other)) != shape:
-            raise ValueError(f"cannot tie memories of different pasts: one has {shape}, the other {other_shape}")
+            raise ValueError(
+                f"cannot tie forward memories that differ in parents, lags or parameter shapes: the first has {shape}, "
+                f"another has {other_shape}"
+            )
         replaced = other.past
         for memory in other.memories:
             if memory.under is replaced:
@@ -399,16 +449,19 @@ def tie(first: Any, *others: Any) -> None:
 def _shape(network: Any) -> dict[str, Any]:
     """Return the properties that tied forward memories must share: parents, lags and parameter shapes."""
     if not isinstance(network, RecurrentNetwork):
-        raise ValueError(f"only recurrent networks have a memory to tie, not a {type(network).__name__}")
+        raise ValueError(f"only recurrent networks can be tied, got a {type(network).__name__}")
     if network.past is None:
-        raise ValueError("cannot tie a network without a past, or with separate memories of several parents")
+        raise ValueError(
+            "only networks with exactly one forward memory can be tied, but this one reads no past, or has one memory "
+            "for each parent (separate=True)"
+        )
     parts = {name: network.extractors[name] for name, _ in network.past.reads if name in network.extractors}
     shapes = {name: [tuple(p.shape) for p in part.parameters()] for name, part in parts.items()}
     return {"reads": network.past.reads, "memory": [tuple(p.shape) for p in network.past.parameters()], **shapes}
 
 
 def _groups(entries: list[tuple[Input, int]], separate: bool) -> list[list[tuple[Input, int]]]:
-    """Group entries by the memory that reads them."""
+    """Return the entries (parent, lag) of each memory: one memory per parent if `separate`, otherwise one for all."""
     if not separate:
         return [entries] if entries else []
     names = dict.fromkeys(parent.name for parent, _ in entries)
@@ -426,10 +479,10 @@ def summary(states: Tensor, direction: int, lengths: Tensor | None) -> Tensor:
 
 @dataclass(frozen=True)
 class Dense:
-    """A multilayer perceptron on pointwise parents (z_t, z_{t-1}, x_{t-3:t-1}, w).
+    """A multilayer perceptron on static parents and parents at single steps, such as w, z_{t-1} and x_{t-3:t-1}.
 
     Args:
-        widths: widths of the layers; with () the features are the parents.
+        widths: widths of the layers; with () the features are the concatenated parents.
         activation: "tanh", "relu", "gelu" or "elu".
     """
 
@@ -437,7 +490,11 @@ class Dense:
     activation: str = "tanh"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DenseNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Raises:
+            ValueError: a parent is read over a range without end, or the activation or a width is invalid.
+        """
         return DenseNetwork(self, inputs, local)
 
 

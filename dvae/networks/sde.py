@@ -1,6 +1,6 @@
 """LinearSDE: the exact transition of a linear stochastic differential equation, for steps at irregular times.
 
-    dz = A z dt + L dW        z_1 ~ N(0, I)        d_t, the time since the previous step
+    dz = A z dt + L dW        z_1 ~ N(0, I)        d_t: time since the previous step (the gap)
 
     p(z_t | z_{t-1}, d_t) = N(F z_{t-1}, Q)        F = e^{A d_t},  Q = int_0^{d_t} e^{A s} L L' e^{A' s} ds
 
@@ -9,12 +9,13 @@ coordinates is independent:
 
     A = S - diag(r)        L L' = 2 diag(r)        S' = -S,  r > 0
 
-Every stable linear equation whose noise reaches all coordinates is a linear map of such an equation, or of a limit with
-some r going to 0. The networks that read z learn this map. The parameterisation has three consequences. The variance
-does not grow over a long gap, and after an infinite gap z follows its initial distribution. The first step of a
-sequence needs no distribution of its own. Omitting a step is equivalent to merging two gaps.
+The solution of every stable linear equation whose noise reaches all coordinates is a linear map of the solution of such
+an equation, or of a limit with some r going to 0. The networks that read z learn this map. The parameterisation has
+three consequences. The variance does not grow over a long gap, and after an infinite gap z follows its initial
+distribution. The first step of a sequence needs no distribution of its own. Omitting a step is equivalent to merging
+two gaps.
 
-LinearSDEGuide has the same kind of transition, multiplied by a Gaussian potential of all its other parents:
+LinearSDEGuide multiplies a transition of the same form by a Gaussian potential, computed from all other parents:
 
     q(z_t | z_{t-1}, d_t, ...) = N(F z_{t-1}, Q) N(e_t; W_t' z_t, I) / constant
 
@@ -47,7 +48,7 @@ ORDER = 22
 
 @dataclass(frozen=True)
 class LinearSDE:
-    """A linear stochastic differential equation from z_{t-1} over a gap, for `distributions.Triangular`.
+    """A network for p(z_t | z_{t-1}, d_t), the transition of a linear SDE over a gap, for `distributions.Triangular`.
 
     Args:
         times: range of the initial relaxation times 1 / r of the coordinates, in the unit of the gaps.
@@ -67,13 +68,13 @@ class LinearSDE:
         """Return the network of a factor p(z_t | z_{t-1}, d_t), for z of dimension `size`.
 
         Raises:
-            ValueError: the parents differ from z_{t-1} and d_t, or the times are not positive and in order.
+            ValueError: the parents differ from z_{t-1} and d_t, or `times` are not positive, finite and in order.
         """
         before = [p for p in inputs if p.lags == (-1,) and p.size == size]
         gaps = [p for p in inputs if p.lags == (0,) and p.size == 1]
         if not (local and len(before) == len(gaps) == 1 and len(inputs) == 2):
             raise ValueError(
-                "a LinearSDE network reads a variable's last value and a gap of size 1, p(z_t | z_{t-1}, d_t), "
+                "LinearSDE needs two parents, the child's last value and a gap of size 1, as in p(z_t | z_{t-1}, d_t), "
                 + _describe_parents(inputs, size)
             )
         return LinearSDENetwork(inputs, before[0], gaps[0].name, self.times)
@@ -83,14 +84,15 @@ class LinearSDE:
 class LinearSDEGuide:
     """The transition of a `LinearSDE` times a Gaussian potential, for `distributions.Triangular`.
 
-    A network that simply reads z_{t-1} and the gap must learn the rotation of z over any time before it can approximate
-    a prior with little noise. This guide contains that rotation from the start. To use the prior's own equation, and
-    compute it once, call `networks.base.share_modules(networks, "equation")` with the networks of both factors.
+    Under a prior with little noise, the guide must know how z rotates over a gap. A general network of z_{t-1} and the
+    gap would have to learn this for gaps of every length; this guide computes it from its equation. To use the prior's
+    own equation, and compute it once, call `networks.base.share_modules(networks, "equation")` with the networks of
+    both factors.
 
     Args:
-        potential: specification of the network of the other parents that outputs e_t and W_t.
-        times: initial relaxation times, as in `LinearSDE`.
-        gap: name of the time since the previous step, which `potential` reads too.
+        potential: specification of the network that computes e_t and W_t from all parents except z_{t-1}.
+        times: range of the initial relaxation times, as in `LinearSDE`.
+        gap: name of the parent d_t, the time since the previous step, which `potential` reads too.
     """
 
     potential: NetworkSpec = field(default_factory=Recurrent)
@@ -101,13 +103,14 @@ class LinearSDEGuide:
         """Return the network of a factor q(z_t | z_{t-1}, d_t, ...), for z of dimension `size`.
 
         Raises:
-            ValueError: the last value or the gap is missing among the parents.
+            ValueError: z_{t-1} or the gap is missing among the parents, or `times` are not positive, finite and in
+                order.
         """
         before = [p for p in inputs if p.lags == (-1,) and p.size == size]
         gaps = [p for p in inputs if p.name == self.gap and p.relation and p.relation.reads(0, 2) and p.size == 1]
         if not (local and len(before) == len(gaps) == 1):
             raise ValueError(
-                f"a LinearSDEGuide network reads a variable's last value and a gap {self.gap} of size 1, such as "
+                f"LinearSDEGuide needs the child's last value and a gap {self.gap} of size 1 among its parents, as in "
                 f"q(z_t | z_{{t-1}}, x_{{1:T}}, {self.gap}_{{1:T}}), " + _describe_parents(inputs, size)
             )
         return LinearSDEGuideNetwork(self, inputs, before[0])
@@ -119,7 +122,7 @@ def _describe_parents(inputs: Sequence[Input], size: int) -> str:
 
 
 class Equation(nn.Module):
-    """The parameters A and L L', and the transitions over gaps.
+    """The parameters A and L L' of a linear stochastic differential equation, and its transitions over gaps.
 
     Args:
         size: D, dimension of z.
@@ -132,7 +135,7 @@ class Equation(nn.Module):
         super().__init__()
         shortest, longest = times
         if not 0 < shortest <= longest < math.inf:
-            raise ValueError(f"times must be positive, the shortest and the longest, got {times}")
+            raise ValueError(f"`times` must be (shortest, longest), positive, finite and in this order, got {times}")
         quantiles = (torch.arange(size) + 0.5) / size
         self.log_rate = nn.Parameter(-math.log(shortest) - math.log(longest / shortest) * quantiles)
         root = (0.5 * self.log_rate.detach()).exp()
@@ -154,8 +157,8 @@ class Equation(nn.Module):
 
         Args:
             gaps: d, (B, T, 1); the value at the first step is ignored.
-            lengths: (B,) numbers of valid steps.
-            name: name of the gaps in messages.
+            lengths: (B,) number of valid steps of each sequence, or None.
+            name: name of the gaps in error messages.
 
         Raises:
             ValueError: a gap is not positive and finite.
@@ -176,8 +179,8 @@ class Equation(nn.Module):
         Args:
             gaps: d, (B, T).
             there: (B, T), False if there is no previous step and z follows its stationary distribution.
-            name: name of the gaps in messages.
-            first: number of the first step, counted from 0.
+            name: name of the gaps in error messages.
+            first: number of the first of the T steps, counted from 0, for error messages.
 
         Raises:
             ValueError: a gap is not positive and finite.
@@ -209,13 +212,13 @@ class Equation(nn.Module):
 
 
 class LinearSDENetwork(Network):
-    """Network of `LinearSDE`; the features are location and whitening matrix, (..., D + D * D).
+    """Network of `LinearSDE`; the features are location and flattened whitening matrix, (..., D + D * D).
 
     Args:
         inputs: the parents.
         before: the parent z_{t-1}.
         gap: name of the parent d_t.
-        times: initial relaxation times, as in `LinearSDE`.
+        times: range of the initial relaxation times, as in `LinearSDE`.
     """
 
     head = Triangular
@@ -244,7 +247,7 @@ class LinearSDENetwork(Network):
         return _features(decay, None, whitening, self._last(previous, t, drawn, decay)), state
 
     def drawn_over(self, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
-        """Return F and the whitening matrix of Q, (B, D, D) each, over gaps that the loop draws."""
+        """Return F and the whitening matrix of Q, (B, D, D) each, at step t of a loop that draws the gaps."""
         gaps = drawn[self.gap][t]
         decay, whitening = self.equation.over(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), self.gap, t)
         return decay[:, 0], whitening[:, 0]
@@ -309,7 +312,7 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
 
         Args:
             moved, whitening: F and U, (..., D, D) each.
-            features: (..., H) of the network of the other parents.
+            features: (..., H) features of the network `potential`.
         """
         with torch.autocast(moved.device.type, enabled=False):
             observation, scale = self.out(features.to(moved)).split([self.size, self.size**2], dim=-1)
@@ -332,9 +335,10 @@ def _features(decay: Tensor, offset: Tensor | None, whitening: Tensor, before: T
 def transition(drift: Tensor, noise: Tensor, gaps: Tensor) -> tuple[Tensor, Tensor]:
     """Return F = e^{A d} and Q = int_0^d e^{A s} N e^{A' s} ds, (K, D, D) each, for dz = A z dt + L dW.
 
-    It sums a series over d / 2^k and doubles k times: F(2d) = F(d)^2 and Q(2d) = Q(d) + F(d) Q(d) F(d)'. It stores F -
-    I in place of F, so there is no cancellation, and both results are accurate for the shortest gaps. For stable A they
-    are also accurate for the longest gaps, where the single matrix exponential of Van Loan (1978) overflows.
+    The function sums a series for the gap d / 2^k and doubles the gap k times: F(2d) = F(d)^2 and
+    Q(2d) = Q(d) + F(d) Q(d) F(d)'. It stores F - I in place of F, so there is no cancellation, and both results are
+    accurate for the shortest gaps. For stable A they are also accurate for the longest gaps, where the single matrix
+    exponential of Van Loan (1978) overflows.
 
     Args:
         drift: A, (D, D).

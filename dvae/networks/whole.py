@@ -25,10 +25,10 @@ from .loop import memoize
 
 @dataclass(frozen=True)
 class WholeEncoder:
-    """Features of a static child from all steps of its parents and from static parents.
+    """A perceptron from all steps of the parents, and from static parents, to features of a static child.
 
     Args:
-        length: N, steps of a sequence; shorter sequences are padded with zeros at the end.
+        length: N, maximum number of steps; shorter sequences are padded with zeros at the end.
         widths: widths of the layers, each followed by the activation.
         activation: "tanh", "relu", "gelu" or "elu".
     """
@@ -38,7 +38,7 @@ class WholeEncoder:
     activation: str = "relu"
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeEncoderNetwork:
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
             ValueError: the child is local, or the factor does not read all steps of a parent.
@@ -48,14 +48,15 @@ class WholeEncoder:
 
 @dataclass(frozen=True)
 class WholeDecoder(WholeEncoder):
-    """All steps of a local child from static parents.
+    """A perceptron from static parents to all steps of a local child.
 
     Args:
         length: N, maximum number of steps.
         widths: widths of the hidden layers, each followed by the activation; the last layer is linear.
         activation: as in `WholeEncoder`.
-        sizes: {name: dimension} of the variables that share the perceptron, in the order of their coordinates.
-        name: name of the child.
+        sizes: {name: dimension} of the variables that share the perceptron, in the order of their coordinates in its
+            output; None if the child does not share it.
+        name: name of the child, which selects its coordinates.
     """
 
     sizes: Mapping[str, int] | None = None
@@ -63,17 +64,17 @@ class WholeDecoder(WholeEncoder):
 
     @override
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeDecoderNetwork:  # type: ignore[override]
-        """Return the network of a factor with these parents.
+        """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
-            ValueError: the child is static, or a parent is not static.
+            ValueError: the child is static, a parent is not static, or `sizes` has another dimension for the child.
         """
         return WholeDecoderNetwork(self, inputs, local, size)
 
 
 def _check_length(steps: int, length: int) -> None:
     if steps > length:
-        raise ValueError(f"this network supports at most {length} steps, got {steps}")
+        raise ValueError(f"this network supports at most {length} steps, got {steps}; build it with length={steps}")
 
 
 class WholeEncoderNetwork(Network):
@@ -102,7 +103,13 @@ class WholeEncoderNetwork(Network):
 
 
 class Trunk(nn.Module):
-    """A perceptron with a linear last layer, from (B, S) to (B, N, D)."""
+    """A perceptron with a linear last layer, from static parents (B, S) to all steps (B, N, D).
+
+    Args:
+        size: S, total dimension of the parents.
+        spec: N and the widths.
+        numbers: D, total dimension of the variables that share the perceptron.
+    """
 
     def __init__(self, size: int, spec: WholeDecoder, numbers: int):
         super().__init__()
@@ -111,7 +118,7 @@ class Trunk(nn.Module):
         self.length = spec.length
 
     def forward(self, given: Sequence[Tensor]) -> Tensor:
-        """Return all steps of all variables."""
+        """Return all steps of all variables, (B, N, D)."""
         return self.made(self.features(given))
 
     def features(self, given: Sequence[Tensor]) -> Tensor:
@@ -120,7 +127,7 @@ class Trunk(nn.Module):
         return features
 
     def made(self, features: Tensor, steps: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:
-        """Return all steps from the features, or compute only the given steps (K,) and coordinates."""
+        """Return values (B, N, D) from features (B, H); compute only `steps` (K,) and `coordinates` if given."""
         weight, bias = (part.unflatten(0, (self.length, -1))[:, coordinates] for part in self.out.parameters())
         if steps is not None:
             weight, bias = weight[steps], bias[steps]
@@ -133,12 +140,16 @@ class WholeDecoderNetwork(FixedLengthNetwork):
 
     def __init__(self, spec: WholeDecoder, inputs: Sequence[Input], local: bool, size: int):
         if not local or any(parent.relation is not None for parent in inputs):
-            raise ValueError("WholeDecoder needs a local child with only static parents, such as p(x_t | z)")
+            parents = ", ".join(f"{p.name} ({p.relation.name if p.relation else 'static'})" for p in inputs)
+            raise ValueError(
+                "WholeDecoder needs a local child with only static parents, such as p(x_t | z), but the child is "
+                f"{'local' if local else 'static'} and the parents are {parents}"
+            )
         super().__init__(inputs, True, size)
         sizes = spec.sizes or {spec.name: size}
         if sizes.get(spec.name) != size:
             raise ValueError(
-                f"{spec.name} has {size} coordinates, but `sizes` of the shared perceptron is {dict(sizes)}"
+                f"{spec.name} has size {size}, but `sizes` of the shared perceptron is {dict(sizes)}; correct `sizes`"
             )
         ends = dict(zip(sizes, accumulate(sizes.values()), strict=True))
         self.places = slice(ends[spec.name] - size, ends[spec.name])

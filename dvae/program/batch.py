@@ -31,17 +31,17 @@ AnyBatch = Tensor | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader of a model's batches.
+    """Validation of a model's batches, and conversion to its precision and representation.
 
     Args:
         sizes: dimension of every variable.
-        local: name to whether the variable has a value for every step.
+        local: dictionary from variable name to whether the variable has a value for every step.
         observed: names of the data variables.
         context: names of the variables that a batch must give.
         view: transformation of the data that the model sees.
         extras: names of other entries that a batch may have.
         made: names of data variables that are deterministic given their parents; they are not passed to a program.
-        distributions: conditionals of the data, which give the support and the events of the values.
+        distributions: conditionals of the data, which declare the support and the coordinates of each joint event.
         density: whether the data have a density, so that a view that changes volume needs a log-determinant.
         grouped: names of static latents that groups of sequences share.
     """
@@ -60,14 +60,14 @@ class Reader:
     def read(
         self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor], wide: Collection[str] = ()
     ) -> Batch:
-        """Return the batch by name, in this precision and as the model sees it.
+        """Return the batch as a dictionary of tensors, in this precision and in the model's representation.
 
         Reading the result again does not change it.
 
         Args:
             batch: as in `DynamicalVAE.model`.
             dtype: precision of floating-point values.
-            means: name to the value at missing entries, where it is not 0.
+            means: dictionary from variable name to the values (D,) of missing entries; 0 for other variables.
             wide: names of variables that are read in float64 whatever the dtype.
 
         Raises:
@@ -112,8 +112,8 @@ class Reader:
                     if not torch.equal(masks[name][..., event].any(-1), masks[name][..., event].all(-1)):
                         raise ValueError(
                             f"the mask of {name} hides some entries of a step and not others, but its distribution has "
-                            f"one density for {len(event)} of them; hide them together, or give {name} a distribution "
-                            "with one for each, such as Normal()"
+                            f"one joint density for {len(event)} of them; hide all of these or none, or give {name} a "
+                            "distribution with a density for each entry, such as Normal()"
                         )
             fill = {name: means[name].to(result[name].dtype) if name in means else 0.0 for name in masks}
             result |= {name: torch.where(mask, result[name], fill[name]) for name, mask in masks.items()}
@@ -124,7 +124,7 @@ class Reader:
     def _check_mask(self, name: str, mask: Tensor, values: Batch) -> None:
         if name not in (*self.observed, self.view.history, WHOLE) or name not in values:
             tensors = {n: v for n, v in values.items() if isinstance(v, Tensor)}
-            raise ValueError(f"there is a mask of {name}, but the batch holds no data of that name: {shapes(tensors)}")
+            raise ValueError(f"the batch has a mask of {name}, but no data of that name; it has {shapes(tensors)}")
         if mask.shape != values[name].shape or mask.dtype != torch.bool:
             raise ValueError(
                 f"the mask of {name} is {mask.dtype} {tuple(mask.shape)}; expected bool {tuple(values[name].shape)}, "
@@ -143,7 +143,7 @@ class Reader:
 
         Args:
             factorization: the factorization.
-            conditionals: name to `Conditional` of each factor.
+            conditionals: dictionary from the child of each factor to its `Conditional`.
             batch: batch that `read` returned.
             length: T; None for the length of the batch.
             size: B, if the batch does not determine it.
@@ -162,7 +162,9 @@ class Reader:
         local = {name: v for name, v in values.items() if v.dim() == 3}
         prefix = {name: v for name, v in local.items() if v.shape[1] < length}
         if max((v.shape[1] for v in local.values()), default=0) > length or not set(prefix) <= set(self.observed):
-            raise ValueError(f"expected {length} steps (fewer of data to continue), the batch holds {shapes(local)}")
+            raise ValueError(
+                f"expected {length} steps, or fewer for data that the model continues; the batch has {shapes(local)}"
+            )
         if lengths is not None:
             if lengths.is_floating_point() or lengths.shape != (size,):
                 raise ValueError(_lengths_message(lengths, length))
@@ -186,13 +188,22 @@ class Reader:
         )
 
     def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:
-        """Pad the history to all steps; its mask hides the padding."""
+        """Pad the history (`views.History`) with zeros to all T steps, in place.
+
+        Args:
+            factorization: factorization whose factors read the history. Their custom masks hide the padding.
+            values: values of the batch by name, changed in place.
+            length: T.
+
+        Raises:
+            ValueError: if a factor reads the history after its last step.
+        """
         name = self.view.history
         if name is None or name not in values or (past := values[name].shape[1]) >= length:
             return
         for factor in factorization.factors:
             if factor.parent(name) is not None and factor.mask(name, length)[:, past:].any():
-                raise ValueError(f"{factor} reads more than the first {past} steps of {name}, but no others exist")
+                raise ValueError(f"{factor} reads {name} after step {past}, its last one; narrow the mask of {name}")
         values[name] = functional.pad(values[name], (0, 0, 0, length - past))
 
     def _check_context(self, factorization: Factorization, values: Mapping[str, Tensor]) -> None:
@@ -207,7 +218,17 @@ class Reader:
     def _check_values(
         self, values: Mapping[str, Tensor], masks: Mapping[str, Tensor], lengths: Tensor | None, length: int
     ) -> None:
-        """Check that values are finite and in the support, and lengths valid, with one synchronisation of the GPU."""
+        """Check that values are finite and in the support, and lengths valid, with one synchronisation of the GPU.
+
+        Args:
+            values: values by name, with 0 or another finite value at missing entries.
+            masks: masks of observed entries by name; missing entries are not compared with the support.
+            lengths: (B,) valid steps of a ragged batch.
+            length: T, upper limit of the lengths.
+
+        Raises:
+            ValueError: if a value or length is invalid.
+        """
         not_finite = {name: ~torch.isfinite(value.sum()) for name, value in values.items()}  # a NaN survives the sum
         outside = {
             name: invalid
@@ -229,14 +250,21 @@ class Reader:
             if invalid.any():
                 distribution, index = self.distributions[name], invalid.nonzero()[0].tolist()
                 raise ValueError(
-                    f"{name} holds {values[name][tuple(index)].item():g} (sequence {index[0]}, coordinate {index[-1]}),"
+                    f"{name} has {values[name][tuple(index)].item():g} (sequence {index[0]}, coordinate {index[-1]}),"
                     f" but under {distribution.factor}, {distribution.head.label}, values are "
                     f"{_describe_support(distribution.support)}; give {name} another"
-                    " distribution, move such entries inside, or hide them by the 'mask' of the batch"
+                    " distribution, correct such entries, or hide them by the 'mask' of the batch"
                 )
 
     def _outside(self, name: str, value: Tensor, mask: Tensor | None, lengths: Tensor | None) -> Tensor | None:
-        """Return which observed entries lie outside the support, as a mask of the value; None if none can be."""
+        """Return a mask of observed entries outside the support; None if the distribution supports all real values.
+
+        Args:
+            name: name of the data variable.
+            value: (B, T, D) or (B, D).
+            mask: True where an entry was observed; None if all were.
+            lengths: (B,) valid steps of a ragged batch.
+        """
         distribution = self.distributions[name]
         if (support := distribution.support) is None:
             return None
@@ -267,7 +295,17 @@ def _lengths_message(lengths: Tensor, length: int) -> str:
 
 
 def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
-    """Return entries as tensors; floating-point values and these names are cast, counts and masks are not."""
+    """Return the entries of a batch as tensors in the precision of the model.
+
+    Floating-point entries and entries in `names` get the dtype, or float64 if they are in `wide`. Masks and counts,
+    such as lengths, keep their type.
+
+    Args:
+        batch: arrays or tensors by name.
+        dtype: precision of the model.
+        names: names of the variables.
+        wide: names of the variables that are read in float64.
+    """
     tensors = Batch()
     for name, value in batch.items():
         if isinstance(value, Mapping):
@@ -363,10 +401,19 @@ def _describe_support(support: Any) -> str:
 
 
 def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tuple[int, int]:
-    """Return B and T, from the values if they determine them."""
+    """Return B and T of a batch.
+
+    Args:
+        values: values of variables by name, which determine B.
+        length: T; None if the values determine it.
+        size: B; used only if there are no values.
+
+    Raises:
+        ValueError: if values differ in B or T, B or T is 0, or T cannot be inferred.
+    """
     sizes = {value.shape[0] for value in values.values()} or {size}
     if len(sizes) > 1:
-        raise ValueError(f"the batch holds different numbers of sequences: {shapes(values)}")
+        raise ValueError(f"all variables of a batch must have the same number of sequences, got {shapes(values)}")
     if sizes == {0}:
         raise ValueError(f"the batch holds no sequences: {shapes(values)}")
     local = {name: value for name, value in values.items() if value.dim() == 3}
@@ -375,7 +422,7 @@ def _extent(values: Mapping[str, Tensor], length: int | None, size: int) -> tupl
         if not steps:
             raise ValueError("cannot infer the number of steps without a batch; pass length=")
         if len(steps) > 1:
-            raise ValueError(f"the batch holds different numbers of steps: {shapes(local)}")
+            raise ValueError(f"all local variables of a batch must have the same number of steps, got {shapes(local)}")
         length = max(steps)
     if length < 1:
         raise ValueError(f"length must be at least 1, got {length}")
@@ -412,7 +459,7 @@ def rows(value: Any, part: slice) -> Any:
 def in_chunks(
     make: Callable[[slice, int], Mapping[str, Tensor]], size: int, samples: int, chunk: int
 ) -> dict[str, Tensor]:
-    """Compute values (S, B, ...) for all sequences and samples in chunks, to limit memory in addition to the result.
+    """Compute values (S, B, ...) for all sequences and samples in chunks, to limit the memory of the computation.
 
     Args:
         make: function of a slice of b sequences and a number of samples n; returns values (n, b, ...) by name.

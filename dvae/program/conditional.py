@@ -1,4 +1,7 @@
-"""One factor of a factorization as a module: a network on the parents and a distribution of its features."""
+"""One factor of a factorization as a module: a network that reads the parents, and a distribution.
+
+The features that the network returns are the parameters of the distribution, or are mapped to them.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ def evaluating(*modules: nn.Module) -> Iterator[None]:
 
 
 def like(module: nn.Module) -> Tensor:
-    """Return a tensor of the module, for its dtype and device."""
+    """Return any parameter or buffer of the module, which shows its dtype and device."""
     for tensor in module.parameters():
         return tensor
     return next(module.buffers())
@@ -65,7 +68,7 @@ class Conditional(nn.Module):
         distribution: description of the distribution.
         generative: True for p, False for q.
         data: names of the data variables.
-        guide: q(w | ...) of a static latent without parents, which some priors contain.
+        guide: q(w | ...) of the same static latent, which some priors evaluate, such as `distributions.Vamp`.
         indicators: names of data that the network reads together with indicators: 1 where an entry was observed, else
             0.
 
@@ -73,8 +76,8 @@ class Conditional(nn.Module):
         ValueError: if the network and the distribution do not fit together.
 
     Attributes:
-        discrete, reparameterised, whole: as the distribution declares (`ConditionalDistribution.discrete`,
-            `ConditionalDistribution.event_dim`).
+        discrete, reparameterised: as the distribution declares (`ConditionalDistribution`).
+        whole: whether all coordinates form one event (`ConditionalDistribution.event_dim`).
     """
 
     interior_point: Tensor | None
@@ -103,8 +106,8 @@ class Conditional(nn.Module):
             if self.network.head and not isinstance(distribution, self.network.head):
                 expected = f"distributions.{self.network.head.__name__}"
                 raise ValueError(
-                    f"the features of {factor} by {network} are the parameters of a {expected}, but its distribution "
-                    f"is {distribution}; give it {expected}()"
+                    f"the network {network} of {factor} returns parameters of a {expected}, but the distribution is "
+                    f"{distribution}; give the factor {expected}()"
                 )
         features = 0 if self.network is None else self.network.features
         self.head = distribution.build(Shape(self.size, features, factor.local, factor.child, data, guide))
@@ -133,10 +136,10 @@ class Conditional(nn.Module):
             self.whole or distribution.batch_shape[-1:] == (self.size,)
         ):
             raise ValueError(
-                f"the distribution of {self.factor} makes a {type(distribution).__name__} of batch "
-                f"{tuple(distribution.batch_shape)} and event {tuple(distribution.event_shape)}; by its event_dim = "
-                f"{self.head.event_dim} it has "
-                + (f"the event {event}" if self.whole else f"no event, and the last dimension {self.size} in its batch")
+                f"the distribution of {self.factor} returns a {type(distribution).__name__} with batch shape "
+                f"{tuple(distribution.batch_shape)} and event shape {tuple(distribution.event_shape)}; its event_dim = "
+                f"{self.head.event_dim} requires the event shape {event}"
+                + ("" if self.whole else f" and a batch shape that ends with {self.size}")
             )
         support: Any = None
         with suppress(NotImplementedError):  # some distributions have no support
@@ -145,9 +148,9 @@ class Conditional(nn.Module):
             declared = self.head.support is None or not is_real(self.head.support)
             if not declared or support.is_discrete != self.discrete:
                 raise ValueError(
-                    f"the distribution of {self.factor} makes a {type(distribution).__name__} on {support}; declare it "
-                    "in the class of the distribution: support (of torch.distributions.constraints), and discrete = "
-                    f"{support.is_discrete}"
+                    f"the distribution of {self.factor} returns a {type(distribution).__name__} with the undeclared "
+                    f"support {support}; declare it in the class of the distribution: support (of "
+                    f"torch.distributions.constraints), and discrete = {support.is_discrete}"
                 )
         self._is_checked = True
 
@@ -186,9 +189,14 @@ class Conditional(nn.Module):
         lengths: Tensor | None = None,
         groups: Groups | None = None,
     ) -> Parameters:
-        """Return the parameters at all steps, (B, T, D), or (B, D) for a static child.
+        """Return the parameters of the distribution at all steps, (B, T, D), or (B, D) for a static child.
 
-        Sequences of a group share them.
+        Args:
+            parents: values of the parents by name, (B, T, D) or (B, D), with presence masks and indicators if any.
+            batch: B.
+            length: T.
+            lengths: (B,) valid steps of a ragged batch.
+            groups: groups of sequences that share the child; features are averaged over each group.
         """
         if self.network is None:
             shape = (batch, length, 0) if self.factor.local else (batch, 0)
@@ -244,7 +252,7 @@ class Conditional(nn.Module):
 
     @property
     def offset(self) -> Tensor | None:
-        """Mean (D,) in float64 that parameters exclude; None if values are in the model's precision."""
+        """Mean (D,) in float64 that is not part of the parameters; None if values are in the model's precision."""
         units = self._output_units
         if units is None or not units.wide or not self.head.centred:
             return None
@@ -267,7 +275,7 @@ class Conditional(nn.Module):
         return self._add_offset(self.head.mean(parameters))
 
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
-        """Return values (..., D) of the child (`ConditionalDistribution.draw`)."""
+        """Return values (..., D) of the child computed from noise, as in `ConditionalDistribution.draw`."""
         return self._add_offset(self.head.draw(parameters, noise))
 
     @property
@@ -280,7 +288,14 @@ class Conditional(nn.Module):
         return value if offset is None else value + offset
 
     def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """Return the state before a loop that draws the parents that are not in `given`."""
+        """Return the initial state of a loop over time that draws the parents missing from `given`.
+
+        Args:
+            given: values of the other parents by name, (B, T, D) or (B, D).
+            batch: B.
+            length: T.
+            lengths: (B,) valid steps of a ragged batch.
+        """
         if self.network is None:
             return tuple(p.unbind(1) for p in self(given, batch, length))
         state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
@@ -292,9 +307,13 @@ class Conditional(nn.Module):
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
     def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
-        """Return the parameters (B, D) at step t and the next state.
+        """Return the parameters (B, D) at step t and the next state of a loop over time.
 
-        The call evaluates `count` steps at once, and t is the last of them.
+        Args:
+            state: result of `start` or of the previous step.
+            t: index of the step, from 0.
+            drawn: values (B, D) by step of the variables that the loop draws, by name.
+            count: number of steps that are evaluated at once, of which t is the last.
         """
         if self.network is None:
             return tuple(p[t] for p in state), state
@@ -313,7 +332,14 @@ class Conditional(nn.Module):
     def forward_chunk(
         self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
     ) -> tuple[Parameters, Any]:
-        """Return the parameters (B, N, D) at N steps from t on, with all their inputs known, and the next state."""
+        """Return the parameters (B, N, D) at N steps whose inputs are all known, and the next state.
+
+        Args:
+            state: result of `start` or of the previous step.
+            t: index of the first of these steps, from 0.
+            count: N.
+            drawn: values (B, D) by step of the variables that the loop draws, by name.
+        """
         if self.network is None:
             return tuple(torch.stack(p[t : t + count], dim=1) for p in state), state
         inner, inputs = self._standardise_draws(state, drawn)
@@ -334,7 +360,7 @@ class Conditional(nn.Module):
         return state.network, {**drawn, **standardised}
 
     def select(self, state: Any, rows: Tensor) -> Any:
-        """Return the state with these rows (N,) of its batch (`networks.loop.select`)."""
+        """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles."""
         if self.network is None:
             return select(state, rows)
         if not isinstance(state, Standardised):
@@ -351,7 +377,16 @@ class Conditional(nn.Module):
         return state
 
     def chain(self, state: Any, direction: int, noise: Tensor) -> tuple[Tensor, Parameters] | None:
-        """Return draws (B, T, D) and their parameters by one fused loop; None if the factor is no Gaussian chain."""
+        """Return draws (B, T, D) and their parameters, computed by one fused loop for all steps.
+
+        Args:
+            state: result of `start`.
+            direction: 1 if the loop runs forward in time, -1 if it runs backward.
+            noise: standard normal noise (B, T, D) of the draws.
+
+        Returns:
+            Draws and parameters, or None if the factor is not a Gaussian chain.
+        """
         if torch.is_autocast_enabled(noise.device.type):  # the fused loop runs in one precision
             return None
         if self.factor.child in self.units:

@@ -2,13 +2,14 @@
 
     p(v, x) = sum over k of prod_t p(k_t | k_{t-1}, ...) p(v_t | k_t, ...) p(x_t | k_t, ...)
 
-The sum is given v, the latents that are drawn, and x, the data (Rabiner, 1989). A factor reads few steps of k, at lags
-up to L, and the recursion keeps the states of L + 1 steps only. All densities come from few evaluations of all steps in
-parallel. Each evaluation uses a sequence of states that repeats with the period of the factor's lags, and every step
-sees one state of its window. Only the recursion is a loop, with three small operations per step.
+The latents v are drawn, the data x are given, and the forward algorithm sums over k (Rabiner, 1989). Factors read k at
+lags of at most L steps, so the recursion keeps the states of L + 1 steps only. Densities are computed before it, for
+all steps in parallel. A factor that reads m consecutive steps of k is evaluated at every sequence of states with period
+m. At each step, these sequences contain every combination of the m states once. Only the recursion is a loop, with
+three small operations per step.
 
-Static latents are enumerated in addition to the chain. Every variable contributes a term to the log joint: its density
-given all earlier variables with the states summed out, log p(x_t | v_{<=t}, x_{<t}). Bounds use these terms.
+Static latents are enumerated in addition to the chain. Every variable contributes a term to the log joint: its log
+density given all earlier variables with the states summed out, log p(x_t | v_{<=t}, x_{<t}). Bounds use these terms.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from .conditional import like
 LARGEST = 4096
 """Maximum number of joint states of a window and the static latents."""
 WIDE = 2**11
-"""Maximum number of transition terms of a step, over all sequences, for blocks; above it they cost more time."""
+"""Maximum number of transition terms per step, over all sequences, at which blocks of steps save time."""
 MAX_SEQUENCES = 2**17
 """Maximum number of state sequences that are enumerated one by one."""
 
@@ -72,7 +73,7 @@ class Window:
         factor: the factor.
         statics: names of the static latents that it reads.
         chain: names of the local latents that it reads.
-        low, high: smallest and largest lag of the local ones.
+        low, high: smallest and largest lag of these local latents, in steps.
     """
 
     factor: Factor
@@ -93,7 +94,7 @@ class EnumerationPlan:
 
     Args:
         generative: the generative factorization.
-        sizes: name to number of states of the latents that are summed out.
+        sizes: dictionary from each summed-out latent to its number of states.
 
     Raises:
         ValueError: if the sum has too many states; the message states their number.
@@ -107,18 +108,18 @@ class EnumerationPlan:
         if states > LARGEST:
             each = ", ".join(f"{name} has {size}" for name, size in self.sizes.items())
             raise ValueError(
-                f"every step would sum over {states:,} states, of {self.lag + 1} steps ({each}), but at most "
-                f"{LARGEST:,} are supported; use fewer states, or shorter lags"
+                f"the discrete latents have {states:,} joint states in {self.lag + 1} consecutive steps ({each}), but "
+                f"a sum supports at most {LARGEST:,}; use fewer states, or shorter lags"
             )
 
     @cached_property
     def statics(self) -> tuple[str, ...]:
-        """Names of the static latents."""
+        """Names of the static latents that are summed out."""
         return tuple(name for name in self.sizes if not self.generative.local(name))
 
     @cached_property
     def chain(self) -> tuple[str, ...]:
-        """Names of the local latents."""
+        """Names of the local latents that are summed out."""
         return tuple(name for name in self.sizes if self.generative.local(name))
 
     @cached_property
@@ -133,7 +134,7 @@ class EnumerationPlan:
 
     @cached_property
     def windows(self) -> dict[str, Window]:
-        """Windows by child, for the factors of summed-out latents and their readers, in the order of the model."""
+        """Dictionary from child to `Window`, for summed-out latents and their readers, in the order of sampling."""
         ordered = (self.generative.factor(name) for block in self.generative.blocks for name in block.names)
         windows = {factor.child: self._window(factor) for factor in ordered}
         return {name: w for name, w in windows.items() if name in self.sizes or w.statics or w.chain}
@@ -145,7 +146,7 @@ class EnumerationPlan:
 
     @cached_property
     def lag(self) -> int:
-        """L, the largest lag."""
+        """L, the largest lag at which a factor reads a summed-out latent, in steps."""
         return max((window.high for window in self.windows.values()), default=0)
 
     def require_data(self, replaced: Collection[str]) -> None:
@@ -157,9 +158,10 @@ class EnumerationPlan:
         parents = {parent.name for factor in self.generative.factors for parent in factor.parents}
         if unsupported := sorted(parents.intersection(replaced)):
             raise ValueError(
-                f"{', '.join(self.sizes)} cannot be summed out, as the model reads its own means or noise in place "
-                f"of {', '.join(unsupported)}. This happens at missing entries and in scheduled sampling, and depends "
-                "on the states; fill the entries, or let no factor read them"
+                f"{', '.join(self.sizes)} cannot be summed out: at missing entries and in scheduled sampling, the "
+                f"model reads its own means or noise instead of {', '.join(unsupported)}, and these depend on the "
+                f"states; fill in missing entries, omit scheduled sampling, or let no factor read "
+                f"{', '.join(unsupported)}"
             )
 
     def _window(self, factor: Factor) -> Window:
@@ -173,9 +175,9 @@ class EnumerationPlan:
             ends = [end for interval in parent.relation.intervals or [(-math.inf, 0)] for end in interval]
             if not factor.local or not all(-math.inf < end <= 0 for end in ends):
                 raise ValueError(
-                    f"{factor} reads {parent}: {parent.name} cannot be summed out, as this needs its "
-                    f"{self.sizes[parent.name]}^T states at all T steps at once. A factor can read a discrete latent "
-                    f"at a few steps up to its own, such as {parent.name}_t or {parent.name}_{{t-1}}"
+                    f"{factor} reads {parent}, so {parent.name} cannot be summed out: the sum would have "
+                    f"{self.sizes[parent.name]}^T terms. A factor of a local variable can read a discrete latent at "
+                    f"fixed lags, such as {parent.name}_t or {parent.name}_{{t-1}}"
                 )
             chain.append(parent.name)
             lags = [*(lags if len(chain) > 1 else []), *(int(-end) for end in ends)]
@@ -191,7 +193,7 @@ class EnumerationPlan:
         if (count := math.prod(sizes)) > MAX_SEQUENCES:
             raise ValueError(
                 f"{', '.join(self.sizes)} have {count:.3g} state sequences in {length} steps, but at most "
-                f"{MAX_SEQUENCES:,} are enumerated; use fewer steps"
+                f"{MAX_SEQUENCES:,} can be enumerated; use fewer steps or states"
             )
         digits = np.stack(np.unravel_index(np.arange(count), sizes)).T
         sequences = {}
@@ -202,7 +204,10 @@ class EnumerationPlan:
         return sequences
 
     def patterns(self, window: Window, length: int) -> dict[str, Tensor]:
-        """Return the states at which a factor is evaluated: name to integers (n, T), or (n,) for static latents."""
+        """Return the n periodic state sequences at which a factor is evaluated, as integers.
+
+        The result is a dictionary from latent to (n, T), or (n,) for a static latent.
+        """
         sizes = [self.sizes[name] for name in window.statics]
         sizes += [self.sizes[name] for name in window.chain for _ in range(window.period)]
         digits = np.stack(np.unravel_index(np.arange(math.prod(sizes)), sizes or [1])).astype(np.int64)
@@ -215,10 +220,10 @@ class EnumerationPlan:
         return states
 
     def places(self, window: Window, length: int) -> Tensor:
-        """Return the index (T, J) of the pattern that a factor sees in each joint state.
+        """Return the index (T, J) of the pattern that contains, at each step, the states that the factor reads.
 
-        For a factor of a summed-out latent, the index includes its own state. The J joint states enumerate the static
-        latents, then the chain at lags L to 0; the last one varies fastest.
+        If the child of the factor is summed out, the index also contains the child's state. The J joint states
+        enumerate the static latents, then the chain at lags L to 0; the last one varies fastest.
         """
         names: list[tuple[str, int | None]] = [(name, None) for name in self.statics]
         names += [(name, lag) for lag in range(self.lag, -1, -1) for name in self.chain]
@@ -240,7 +245,7 @@ class EnumerationPlan:
 
     @torch.inference_mode(False)
     def placed(self, window: Window, length: int, device: torch.device) -> tuple[dict[str, Tensor], Tensor]:
-        """Return patterns and places on a device; each transfer happens once."""
+        """Return `patterns` and `places` on a device, where they are kept after the first call."""
         key = window.factor.child, length, device
         if key not in self._device_patterns:
             patterns = {name: value.to(device) for name, value in self.patterns(window, length).items()}
@@ -275,7 +280,16 @@ class Enumeration:
         self._steps = sum(self._local.values(), none).expand(shape)
 
     def _logs(self, name: str, window: Window) -> Tensor:
-        """Return log densities or probabilities in all joint states, (B or 1, T, M, K^L, K), or (B or 1, M)."""
+        """Return the log density or log probability of a variable in every joint state of the discrete latents.
+
+        Args:
+            name: name of the variable.
+            window: summed-out latents that its factor reads.
+
+        Returns:
+            (B, T, M, K^L, K) for a local variable, or (B, M) for a static one; B is 1 if all sequences have the same
+            values.
+        """
         sums, run, local = self.sums, self.rollout, window.factor.local
         conditional, is_summed = run.conditionals[name], name in sums.sizes
         patterns, places = sums.placed(window, run.length, like(conditional).device)
@@ -302,7 +316,7 @@ class Enumeration:
 
     @cached_property
     def shares(self) -> dict[str, Tensor]:
-        """Log density of each reader given all earlier variables, by name: (B, T), or (B,) if static."""
+        """Dictionary from each reader to its log density given all earlier variables: (B, T), or (B,) if static."""
         filtered = self._forward(self._start, self._steps)[:, :-1, ..., None].expand_as(self._steps)
         shares = {}
         for logs, sofar in ((self._static, torch.zeros_like(self._start)), (self._local, filtered)):

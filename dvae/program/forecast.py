@@ -34,7 +34,7 @@ def forecast(
     fix: Mapping[str, Tensor] | None,
     chunk: int,
 ) -> dict[str, Tensor]:
-    """Infer the latents of the past with the guide, then run the model free.
+    """Infer the latents of the past with the guide, then continue with draws from the model.
 
     If the view makes the whole past context (`views.Past`), the guide has no data to read, and latents come from the
     prior.
@@ -45,7 +45,9 @@ def forecast(
     names: Any = batch if isinstance(batch, Mapping) else ()
     redrawn = [name for name in model.shared if name not in names]  # drawn for each sample
     if data.lengths is not None:
-        raise ValueError("forecast continues sequences of one length; cut the batch to it, or forecast them in turn")
+        raise ValueError(
+            "forecast continues sequences of one length, but the batch has 'lengths'; forecast each length separately"
+        )
     first = data.get(model.view.history or model.observed[0])
     size, past = (len(next(v for v in data.values() if isinstance(v, Tensor))), 0) if first is None else first.shape[:2]
     fixed_data = {
@@ -95,12 +97,23 @@ def forecast(
 
 
 def _fixed_values(model: Any, values: Mapping[str, Tensor], data: Batch, size: int, horizon: int) -> dict[str, Tensor]:
-    """Return the fixed values as the model sees them; data include the past."""
+    """Return the fixed values in the model's representation; values of data variables start with the past.
+
+    Args:
+        model: model that forecasts.
+        values: fixed values by name, futures (B, H, D) of data variables or values (B, D) of static latents.
+        data: batch of the past, as returned by `read`.
+        size: B.
+        horizon: H.
+
+    Raises:
+        ValueError: if a variable cannot be fixed, or a value has the wrong shape.
+    """
     free = {*model.observed, *(name for name in model.latents if not model.generative.local(name))}
     for name, value in values.items():
         if name not in free or free & set(model.observed) <= set(values):
             raise ValueError(
-                f"cannot fix {', '.join(values)}; fix some of {', '.join(sorted(free))}, but not all of the data"
+                f"cannot fix {', '.join(values)}; fix some of {', '.join(sorted(free))}, but not all data variables"
             )
         shape = (size, horizon, model.sizes[name]) if name in model.observed else (size, model.sizes[name])
         if value.shape != shape:
@@ -140,7 +153,9 @@ def reconstruct(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[s
 def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, Tensor]:
     """Return probabilities of the states that are summed out, given the data and latents from the guide."""
     if not model.summed:
-        raise ValueError(f"{model.generative} sums out no latent; give discrete latents sizes of dvae.Discrete")
+        raise ValueError(
+            f"{model.generative} sums out no latent; set the size of a discrete latent to dvae.Discrete(states)"
+        )
     data = model.read(batch)
     run = model.rollout(data, guide=True)  # validates all sequences
 
@@ -153,7 +168,7 @@ def states(model: Any, batch: AnyBatch, samples: int, chunk: int) -> dict[str, T
 
 
 def _with_latents(model: Any, batch: AnyBatch, latents: Mapping[str, Tensor]) -> Any:
-    """Return the generative run with data and latents known."""
+    """Return a run of the generative model with the values of data and latents."""
     rollout = model.rollout(batch)
     rollout.values.update(latents)
     return rollout
@@ -171,8 +186,8 @@ def impute(
     drawing = model.is_drawn() if draw is None else draw
     if particles < 1 or (particles > 1 and not (drawing and model.likelihood)):
         raise ValueError(
-            f"particles must be at least 1, got {particles}; more choose among draws (draw=True) by their likelihood, "
-            f"which {model.generative} {'has' if model.likelihood else 'does not have'}"
+            f"particles must be at least 1, and more than 1 require draws (draw=True) and a likelihood, which "
+            f"{model.generative} {'has' if model.likelihood else 'does not have'}; got {particles} and draw={drawing}"
         )
     draws = (
         _impute_draws(model, batch, samples, chunk, particles)
@@ -231,7 +246,7 @@ def _resample(
     Args:
         draws: function that returns values (n, b, ...) and `WEIGHT` (n, b) for a slice of b sequences and n draws.
         size: B.
-        samples, particles: S and K.
+        samples, particles: S, number of samples to keep, and K, number of draws per sample.
         chunk: maximum of sequences times draws at once.
         groups: groups of sequences that share latents; a group is resampled jointly.
     """

@@ -4,8 +4,8 @@
 
 The latent g has one value for all sequences with the same "group" in a batch. Its guide reads all of them: their
 features are averaged before the distribution, as in neural processes (Garnelo et al. 2018, arXiv 1807.01622) and deep
-sets. Every sequence stores the value of its group and an equal share of its density. Shapes and sums are therefore the
-same as without groups.
+sets. Every sequence stores the value of its group and an equal share of the group's log density. Shapes and sums are
+therefore the same as without groups.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Groups:
             ValueError: if the labels are not integers of shape (B,).
         """
         if index.dim() != 1 or index.is_floating_point():
-            raise ValueError(f"group is {index.dtype} {tuple(index.shape)}; expected whole numbers (B,)")
+            raise ValueError(f"'group' of the batch is {index.dtype} {tuple(index.shape)}; expected integers (B,)")
         _, place, count = torch.unique(index, return_inverse=True, return_counts=True)
         rows = torch.arange(len(place), device=place.device)
         # the smallest row: with several writes to one place, the last one is undefined on a GPU
@@ -108,9 +108,11 @@ class Grouped(TorchDistribution):
             return self.groups.shared(self.base.sample(torch.Size(sample_shape)))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Grouped:
-        """Return itself; only its own batch shape is supported."""
+        """Return the distribution itself; any other batch shape raises an error."""
         if torch.Size(batch_shape) != self.batch_shape:
-            raise NotImplementedError(f"the batch of its groups is {self.batch_shape}, not {batch_shape}")
+            raise NotImplementedError(
+                f"a grouped latent of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}"
+            )
         return self
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -62,11 +62,11 @@ class DynamicalVAE(nn.Module):
             generative factor without parents is N(0, I), unless "p(w)" itself is a key, for example with
             `distributions.Mixture()`.
         observed: names of the data variables; every other variable with a generative factor is a latent.
-        masks: custom relations, name to function of T (`Factorization.parse`).
+        masks: custom relations, as a dictionary from name to a function of T (`Factorization.parse`).
         view: transformation of the data that the model sees, such as a split into parts (`dvae.data.views`); none by
             default.
-        shared: static context, name to distribution. If a batch does not give such a variable, the programs draw it
-            once for all sequences of the batch. A forecast draws it once for each sample.
+        shared: dictionary from static context variable to its distribution. If a batch does not give such a variable,
+            the programs draw it once for all sequences of the batch. A forecast draws it once for each sample.
         grouped: static latents that the sequences of a group share. A batch gives the groups as "group" (B,); without
             it, every sequence is its own group (`dvae.program.groups`).
         indicators: data variables for which the guide also reads which entries were observed. Each coordinate has an
@@ -87,7 +87,7 @@ class DynamicalVAE(nn.Module):
     extras: ClassVar[tuple[str, ...]] = ()
     """Names of batch entries that are not variables, but that `penalties` reads."""
     forks: ClassVar[bool] = True
-    """Whether a forecast continues each row once per draw; a subclass may use `draws` differently."""
+    """Whether `draws` repeats the rows of a forecast; False in a subclass that uses `draws` differently."""
     per: str = "step"
     """Unit of one log-likelihood: "step", "frame" or "window"."""
 
@@ -138,8 +138,8 @@ class DynamicalVAE(nn.Module):
         for name in self.shared:
             if name not in self.context or self.generative.local(name) or self.inference.local(name):
                 raise ValueError(
-                    f"{name} must be static context to be drawn once for all sequences: a parent without a "
-                    f"factor, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
+                    f"only static context can be drawn once for all sequences, and {name} is not: it must be a parent "
+                    f"without a factor, such as in p(x_t | {name}); context is {', '.join(self.context) or 'nothing'}"
                 )
         self.grouped = tuple(grouped)
         self._check_grouped()
@@ -158,7 +158,9 @@ class DynamicalVAE(nn.Module):
             self.encoder: Any = guides
         self._check_latents()
         if masses := [name for name in self.observed if self.generator[name].discrete and not self.view.keeps_volume]:
-            raise ValueError(f"{self.view} changes volume, but {', '.join(masses)} is discrete and has no volume")
+            raise ValueError(
+                f"{self.view} changes volume, but {', '.join(masses)} is discrete; use a view that does not"
+            )
         self.reader = Reader(
             self.sizes,
             {**_locality(self.inference), **_locality(self.generative)},
@@ -201,12 +203,14 @@ class DynamicalVAE(nn.Module):
     def _check_grouped(self) -> None:
         for name in self.grouped:
             if name not in self.latents or self.generative.local(name):
-                raise ValueError(f"groups share static latents, but {name!r} is not one of {self.generative.text!r}")
+                raise ValueError(
+                    f"`grouped` must name static latents, but {name!r} is not one of {self.generative.text!r}"
+                )
             others = [p.name for p in self.generative.factor(name).parents if p.name not in self.grouped]
             if others:
                 raise ValueError(
                     f"{self.generative.factor(name)} reads {', '.join(others)}, which differs between sequences of a "
-                    "group; a shared latent can only read what groups share"
+                    "group; a grouped latent can read only variables that a group shares"
                 )
 
     def _check_latents(self) -> None:
@@ -237,8 +241,8 @@ class DynamicalVAE(nn.Module):
 
         Args:
             name: name of the variable.
-            coordinates: how to read and produce each coordinate, such as a column of a table; replaces the fitted
-                values.
+            coordinates: units of each coordinate, such as a column of a table; they replace the mean and scale that
+                `fit` would set.
 
         Raises:
             ValueError: if the variable is unknown.
@@ -292,7 +296,7 @@ class DynamicalVAE(nn.Module):
     def rollout(
         self, batch: AnyBatch | None, length: int | None = None, size: int = 1, *, guide: bool = False
     ) -> Rollout:
-        """Return a run over a batch that draws on demand.
+        """Return a `Rollout` over a batch, which draws variables on demand.
 
         `model` and `guide` turn such a run into sample sites. Use it to evaluate conditional distributions step by
         step, as the oracle and the particle filter do.
@@ -335,20 +339,20 @@ class DynamicalVAE(nn.Module):
                 a variable with units). Arrays become tensors in the model's precision.
             length: T. If it exceeds the length of the data, the program continues the data.
             size: B, if the batch does not determine it.
-            prefix: name to the first values (B, O, D) of a latent, or to the value (B, C) of a static latent that is
-                summed out.
+            prefix: dictionary from latent to its first values (B, O, D), or to the value (B, C) of a static latent that
+                is summed out.
             mean_emission: in a free run, set the data variables, or the named ones, to their means instead of drawing
                 them.
             scheduled_sampling: replacement for the data's history: a `ScheduledSampling`, an
                 `InputNoise`, or a number. A number sets the probability or the share of the noise of the model's
                 attribute `feeding`.
-            draws: latent to a number n: the program draws this variable n times for each sequence and continues each
-                draw. Later variables have n times as many rows, ordered draw by draw.
+            draws: dictionary from latent to a number n. The program draws the latent n times for each sequence and
+                continues each draw, so later variables have n times as many rows, ordered draw by draw.
             curriculum: progress of the curriculum for the draws of shared context, from 0 to 1
                 (`distributions.Subset`).
 
         Returns:
-            Name to value of every variable.
+            Dictionary from variable name to value.
         """
         self._register()
         self._check_draws(draws or {})
@@ -398,7 +402,7 @@ class DynamicalVAE(nn.Module):
             draws: numbers of draws, as given to the program.
 
         Returns:
-            Name to (B,), positive where it costs.
+            Dictionary from site name to energies (B,), which are subtracted from the log joint.
         """
         return {}
 
@@ -417,14 +421,16 @@ class DynamicalVAE(nn.Module):
         """Run the inference program q, with the arguments of `model`.
 
         Returns:
-            Name to value of every latent.
+            Dictionary from latent to value.
         """
         self._register()
         self._check_draws(draws or {})
         rollout = self.rollout(self.read(batch, curriculum=curriculum), guide=True)
         for name in self.observed:
             if name not in rollout.values and any(name in c.parents for c in self.encoder.values()):
-                raise ValueError(f"the guide reads {name}, but the batch has {', '.join(rollout.values) or 'nothing'}")
+                raise ValueError(
+                    f"the guide reads {name}; give it in the batch, which has {', '.join(rollout.values) or 'nothing'}"
+                )
         values = {}
         for name in self.latents:
             n = (draws or {}).get(name, 1)
@@ -453,7 +459,7 @@ class DynamicalVAE(nn.Module):
                 f"draws {', '.join(prior) or 'nothing'} and the guide {', '.join(self.latents) or 'nothing'}"
             )
         if any(count < 1 for count in draws.values()):
-            raise ValueError(f"draws must be numbers from 1, got {dict(draws)}")
+            raise ValueError(f"draws must be at least 1 for each latent, got {dict(draws)}")
 
     # Uses of a model -----------------------------------------------------------------------------------------------
 
@@ -467,7 +473,7 @@ class DynamicalVAE(nn.Module):
             batch: context.
 
         Returns:
-            Name to draws (n, T, D), or (n, D) for a static latent.
+            Dictionary from variable name to draws (n, T, D), or (n, D) for a static latent.
         """
         with self.running():
             data = self.read(batch, size=n)
@@ -494,13 +500,13 @@ class DynamicalVAE(nn.Module):
                 noise: they vary by the latents alone, and their quantiles are not prediction intervals. None draws,
                 unless the emission's scale is the weight of a squared error.
             fix: values that all samples share: futures (B, H, D) of data variables, or values (B, D) of static latents,
-                such as a sample of an earlier forecast. Later variables read it; latents are not inferred from it.
+                such as a sample of an earlier forecast. Later variables read them; latents are not inferred from them.
             chunk: maximum of sequences times samples in memory, in addition to the result. Random draws follow the
                 chunks.
 
         Returns:
-            Name to (S, B, H, D) for data, (S, B, O + H, D) for local latents and (S, B, D) for static ones. With parts,
-            the result includes the whole.
+            Dictionary from variable name to values: (S, B, H, D) for data, (S, B, O + H, D) for local latents and
+            (S, B, D) for static ones; if the view splits the data into parts, also the whole array.
 
         Raises:
             ValueError: if the batch is ragged, local context ends before the horizon, or a value cannot be fixed.
@@ -518,7 +524,8 @@ class DynamicalVAE(nn.Module):
             chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
-            Name to (S, B, T, D) for every data variable; with parts, the result includes the whole.
+            Dictionary from data variable to means (S, B, T, D); if the view splits the data into parts, also the whole
+            array.
         """
         with self.running():
             return reconstruct(self, batch, samples, chunk)
@@ -529,14 +536,13 @@ class DynamicalVAE(nn.Module):
     ) -> dict[str, Tensor]:
         """Fill in missing entries S times; observed entries keep their values.
 
-        The guide reads all observed entries, before and after the missing ones. Means of missing entries differ only as
-        far as the draws of the latents do. Draws also have the noise of the emission, and later entries read the
-        earlier ones.
+        The guide reads all observed entries, before and after the missing ones. Means of missing entries vary only
+        because the latents vary. Draws also have the noise of the emission, and later entries read the earlier ones.
 
         With one particle, only the guide uses observations after a missing entry. More particles correct the guide
-        (Mattei and Frellsen, 2019, arXiv 1812.02633). The method draws S K latents and missing entries, and resamples S
-        of them with the weights p(z, x observed) / q(z). As K grows, these become draws given all observed entries.
-        Longer sequences require more particles.
+        (Mattei and Frellsen, 2019, arXiv 1812.02633). The method draws S K latents and missing entries, and keeps S
+        of them, sampled with the weights p(z, x observed) / q(z). As K grows, these become draws given all observed
+        entries. Longer sequences require more particles.
 
         Some models do not generate the first frames, which are context. Missing entries there repeat the first frame
         that the model generates.
@@ -545,11 +551,11 @@ class DynamicalVAE(nn.Module):
             batch: batch with a "mask", as in `model`.
             samples: S, draws of the latents for each sequence.
             draw: draw the missing entries (True) or use their means (False); None uses `is_drawn`.
-            particles: K, candidates for each sample.
+            particles: K, number of draws from which each sample is chosen.
             chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
-            Name to (S, B, T, D) for the variables that have a mask.
+            Dictionary from the variables with a mask to their values (S, B, T, D).
 
         Raises:
             ValueError: if the batch has no mask, or `particles` is below 1, or above 1 for means or a model without a
@@ -562,8 +568,8 @@ class DynamicalVAE(nn.Module):
     def states(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
         """Return probabilities of the states that are summed out, given all data and draws of the latents.
 
-        Their mean over draws approximates the posterior as well as the guide does. They are exact for a model without
-        other latents.
+        Without other latents, the probabilities are exact. With other latents, their mean over draws is exact only if
+        the guide is the posterior of these latents.
 
         Args:
             batch: as in `model`.
@@ -571,7 +577,7 @@ class DynamicalVAE(nn.Module):
             chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
-            Name to (S, B, T, C), or (S, B, C) for a static latent.
+            Dictionary from summed-out latent to probabilities (S, B, T, C), or (S, B, C) if it is static.
 
         Raises:
             ValueError: if the model sums nothing out.
@@ -612,7 +618,7 @@ class DynamicalVAE(nn.Module):
             yield
 
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
-        """Return a batch by name, in the model's precision and representation, with missing entries filled.
+        """Return a batch as a dictionary, in the model's precision and representation, with missing entries filled in.
 
         A batch that was read before is returned unchanged. Shared variables are drawn if the batch does not give them,
         at a Pyro site outside the plate. Model and guide use the same draw, which therefore adds nothing to a bound. A
@@ -622,7 +628,7 @@ class DynamicalVAE(nn.Module):
             batch: as in `model`.
             size: B, if the batch does not determine it.
             curriculum: as in `model`.
-            precise: read variables that have units in float64 if the batch holds them so, for fitting the units.
+            precise: whether variables with units stay in float64 if the batch has them in float64, to fit the units.
 
         Raises:
             ValueError: if the batch has names that the model does not know, a mask without its variable, or data that
@@ -659,12 +665,12 @@ class DynamicalVAE(nn.Module):
         """Map data variables that the model produced back to data space, through the inverse of the view.
 
         Args:
-            values: name to (..., B, T, D), in the model's space.
+            values: dictionary from data variable to values (..., B, T, D) in the model's representation.
             data: the batch that they belong to, as returned by `read`. It contains what the inverse of the view needs,
                 such as a heading; without it, that part of the transformation is not inverted.
 
         Returns:
-            The same values; if the view splits the data into parts, the whole is added.
+            The values in data space; if the view splits the data into parts, also the whole array.
         """
         added = {name: data[name] for name in self.view.names if name in data} if data else {}
         return {**values, **self.view.inverse(Batch(added | {n: v for n, v in values.items() if n in self.observed}))}
@@ -681,7 +687,10 @@ def _locality(factorization: Factorization) -> dict[str, bool]:
 
 
 def _note(factorization: Factorization, rollout: Rollout) -> Any:
-    """Return the `infer` entry of a site: bounds use it to choose analytic KL terms and to average draws."""
+    """Return the factorization and the run for a site's `infer` entry.
+
+    Bounds read them to choose analytic KL terms and to average over draws.
+    """
     return {"program": factorization, "run": rollout}
 
 

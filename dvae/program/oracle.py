@@ -107,13 +107,13 @@ class Oracle:
     variable reads padding.
 
     Args:
-        model: a `linear_gaussian_surrogate`, or any `DynamicalVAE` of Linear networks with fixed scales.
+        model: a `linear_gaussian_surrogate`, or any `DynamicalVAE` with `networks.Linear` and normals of fixed scale.
         steps: T.
 
     Raises:
         TypeError: if `model` is not a model or `steps` is not an integer.
-        ValueError: if the model is not linear-Gaussian given its discrete states, or has context or energies. Methods
-            raise it if a batch has another length or groups, or lacks a data variable.
+        ValueError: if the model is not linear-Gaussian given its discrete states, or has context or penalties. Methods
+            also raise it for a batch with another number of steps, with groups, or without a data variable.
 
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
@@ -129,16 +129,20 @@ class Oracle:
             )
         require(Count, steps=steps)
         if model.context:
-            raise ValueError(f"the oracle has no distribution of the context {', '.join(model.context)}")
+            raise ValueError(
+                f"the oracle requires a distribution of {', '.join(model.context)}; give this context a factor"
+            )
         if type(model).penalties is not DynamicalVAE.penalties:
-            raise ValueError(f"{type(model).__name__} adds energies to the log joint, which is then not normal")
+            raise ValueError(
+                f"{type(model).__name__} has penalties, so its joint is not normal; use a model without them"
+            )
         # float32 does not resolve affine functions of a variable far from 0
         self.model, self.steps = deepcopy(model).double() if model.wide else model, steps
         for name in model.summed:
             if other := [parent for parent in model.generator[name].parents if parent not in model.summed]:
                 raise ValueError(
-                    f"{model.generator[name].factor} reads {', '.join(other)}, so states depend on continuous "
-                    "variables and no exact result exists; the oracle needs states that read only states"
+                    f"{model.generator[name].factor} reads {', '.join(other)}, so discrete states depend on continuous "
+                    "variables and no exact result exists; let discrete latents read only discrete latents"
                 )
 
     def _size(self, name: str) -> int:
@@ -150,7 +154,7 @@ class Oracle:
         if missing := [name for name in self.model.observed if name not in run.values]:
             raise ValueError(f"the batch has no {', '.join(missing)}; the oracle needs a value of every data variable")
         if run.length != self.steps:
-            raise ValueError(f"the batch has {run.length} steps, but this oracle is Oracle(model, {self.steps})")
+            raise ValueError(f"this oracle was built for {self.steps} steps; build Oracle(model, {run.length})")
         if run.groups is not None:
             raise ValueError(
                 f"sequences of a group share {', '.join(self.model.grouped)}, but the oracle treats sequences one by "
@@ -164,9 +168,12 @@ class Oracle:
         return torch.cat([values[name].flatten(1) for name in names], dim=1)
 
     def _count_mask(self, names: tuple[str, ...], run: Rollout | None, observed: bool = True) -> Tensor:
-        """Return (R, N), 1 at entries that count and 0 at padding; R is 1 if all entries count.
+        """Return a mask (R, N) of stacked variables: 1 at valid entries, 0 at padding.
 
-        With `observed`, missing entries do not count either.
+        Args:
+            names: names of the variables, in the order of stacking.
+            run: run over a batch of R sequences. R is 1 without a run, or if all its sequences are complete.
+            observed: whether missing entries are 0 too.
         """
         if run is None or not _is_partial(run):
             return torch.ones(1, sum(map(self._size, names)), dtype=torch.float64)
@@ -182,7 +189,14 @@ class Oracle:
     def _system(
         self, conditionals: Mapping[str, Any], names: tuple[str, ...], data: tuple[str, ...], run: Rollout | None = None
     ) -> _System:
-        """Return the conditionals as affine functions, from their locations at 0 and at every unit vector."""
+        """Return conditionals as one affine system, from their locations at 0 and at every unit vector.
+
+        Args:
+            conditionals: conditional of each variable by name.
+            names: names of the variables v of the system, in the order of stacking.
+            data: names of the variables d that the system reads.
+            run: run over a batch with missing entries or padding; None for complete sequences.
+        """
         columns = (*names, *data)
         valid, valid_own = (self._count_mask(each, run, observed=False) for each in (columns, names))
         rows, count = valid.shape
@@ -213,13 +227,13 @@ class Oracle:
         linear = isinstance(conditional.network, LinearNetwork) and isinstance(conditional.head, FixedNormalModule)
         if not linear and not (conditional.network is None and isinstance(conditional.head, Gaussian)):
             raise ValueError(
-                f"{conditional.factor} is not linear-Gaussian: the oracle needs networks.Linear with "
-                "distributions.FixedNormal, as in dvae.linear_gaussian_surrogate, or a normal if it has no "
-                "parents"
+                f"{conditional.factor} is not linear-Gaussian; give it networks.Linear with distributions.FixedNormal, "
+                "as in dvae.linear_gaussian_surrogate, or, if it has no parents, any normal distribution"
             )
         if log_parents := [name for name in conditional.parents if name in units and units[name].logarithms]:
             raise ValueError(
-                f"{conditional.factor} reads logarithms of {', '.join(log_parents)}, so it is not linear in them"
+                f"{conditional.factor} reads logarithms of {', '.join(log_parents)}, so it is not linear in them; use "
+                "units without logarithms (floor=0)"
             )
 
     def _joint(self) -> tuple[Tensor, Tensor]:
@@ -230,17 +244,23 @@ class Oracle:
         """
         if self.model.summed:
             raise ValueError(
-                f"with {', '.join(self.model.summed)} summed out, the posterior is a mixture of normals. The KL gap "
-                "of a normal guide to it is not known exactly; evidence and posterior moments are"
+                f"{', '.join(self.model.summed)} is summed out, so the posterior is a mixture of normals, and bound "
+                "and KL gap of a guide have no closed form; use `evidence` and `posterior`, which are exact"
             )
         _, means, precision = self._mixture(None)
         return means[0, 0], precision[0]
 
     def _mixture(self, run: Rollout | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return log probability (C,) and mean (R, C, N) of each state sequence, and their common precision (R, N, N).
+        """Return the joint of latents and data as a mixture of normals over C state sequences of discrete latents.
 
         The model replaces a missing entry by its mean, a function of its parents; the entry itself is an independent
         N(0, 1).
+
+        Args:
+            run: run over a batch; None for one complete sequence.
+
+        Returns:
+            Log probabilities (C,) and means (R, C, N) of the components, and their common precision (R, N, N).
         """
         model, names = self.model, (*self.model.latents, *self.model.observed)
         system = self._system(model.generator, names, model.summed, run)
@@ -267,7 +287,7 @@ class Oracle:
         return logs
 
     def _guide(self, run: Rollout | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return gain on the data, offset, and a root R of the covariance R R' of q(latents | data), for each row."""
+        """Return q(latents | data) = N(gain data + offset, root root') as gain, offset and root, for each sequence."""
         system = self._system(self.model.encoder, self.model.latents, self.model.observed, run)
         lhs = torch.eye(system.bias.shape[1], dtype=torch.float64) - system.weights
         right = torch.cat([system.data_weights, system.bias[..., None], torch.diag_embed(system.scale)], dim=-1)
@@ -322,7 +342,7 @@ class Oracle:
         return means[..., :n] + (data[:, None] - means[..., n:]) @ gain.mT, within
 
     def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """Return the exact ELBO of the model's guide, (B,), without sampling."""
+        """Return the exact ELBO (B,) of the model's guide for data (B, T, D), computed in closed form."""
         evidence = self.evidence(x)
         if not self.model.latents:
             return evidence
@@ -352,7 +372,7 @@ class Oracle:
 
     @staticmethod
     def _divergence(distance: Tensor, precision: Tensor, root: Tensor) -> Tensor:
-        """Return KL(N(m, root root'), N(n, precision^-1)), given the distance of m and n under the precision."""
+        """Return KL(N(m, root root'), N(n, precision^-1)), given the squared Mahalanobis distance of m and n."""
         spread = (root.mT @ precision * root.mT).sum((-2, -1))
         log_volume = torch.linalg.slogdet(precision)[1] + 2 * torch.linalg.slogdet(root)[1]
         divergence: Tensor = 0.5 * (spread + distance - root.shape[-1] - log_volume)
@@ -408,7 +428,7 @@ def kl_gap(
         tensor([True])
     """
     if min(steps, seeds) < 1:
-        raise ValueError(f"a cost needs at least 1 step and 1 model, got {steps} and {seeds}")
+        raise ValueError(f"`steps` and `seeds` must be at least 1, got {steps} and {seeds}")
     model = Factorization.parse(generative)
     parsed = guide(model, inference, observed)
     context = _context(model, parsed)
@@ -462,7 +482,7 @@ def model_kl_gap(
         tensor([True])
     """
     if min(steps, seeds) < 1:
-        raise ValueError(f"a cost needs at least 1 step and 1 model, got {steps} and {seeds}")
+        raise ValueError(f"`steps` and `seeds` must be at least 1, got {steps} and {seeds}")
     model, smaller = Factorization.parse(generative), Factorization.parse(reduced)
     if {*model.variables} != {*smaller.variables}:
         names = ", ".join(model.variables)
@@ -600,6 +620,6 @@ def ones(*equations: Factorization) -> dict[str, int]:
 
 
 def _costliest_first(factorization: Factorization, cost: Callable[[Factorization], Tensor]) -> dict[str, Tensor]:
-    """Return the cost of each edge by its name, largest mean first."""
+    """Return a dictionary from the name of each edge to its cost, largest mean first."""
     costs = {factorization.describe_edge(*edge): cost(factorization.without(*edge)) for edge in factorization.edges}
     return dict(sorted(costs.items(), key=lambda item: -float(item[1].mean())))

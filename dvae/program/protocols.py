@@ -36,7 +36,7 @@ class Program(Protocol):
 
 @runtime_checkable
 class Emitting(Protocol):
-    """A forecaster that decides whether it draws the data."""
+    """A forecaster with a default for whether its forecasts draw the data or use means."""
 
     def is_drawn(self, means: bool = False) -> bool:
         """Return whether forecasts draw the data by default, as in `DynamicalVAE.is_drawn`."""
@@ -48,7 +48,7 @@ class Forecasting(Protocol):
 
     @property
     def likelihood(self) -> bool:
-        """Whether there is a bound to score."""
+        """Whether the model has a bound, which evaluation then reports."""
 
     @property
     def generative(self) -> Factorization:

@@ -35,16 +35,17 @@ class ScheduledSampling:
 
     Args:
         probability: probability of each frame, independently.
-        passes: None runs through time, exactly. A number of passes approximates this in parallel: each pass computes
-            the means of all steps at once from the history of the previous pass (T passes are exact). Within a pass,
-            several data variables follow the order of the model: a variable reads the means of earlier ones from the
-            same pass.
+        passes: None computes the means step by step, which is exact. A number of passes approximates this in parallel:
+            each pass computes the means of all steps at once from the history of the previous pass (T passes are
+            exact). If the model has several data variables, each reads the means of earlier variables from the same
+            pass.
         gradient: whether gradients flow through the means, and so back in time. Without it, as in Bengio et al., a step
             takes half the time or less, but the gradient differs from the gradient of the bound with scheduled
             sampling. Means at missing entries always have a gradient.
         start: number of first frames that are never replaced, such as those that a forecast observes.
-        blocks: numbers of frames: after `start`, the first number stays, the second may be replaced, and so on in turns
-            (Zhou et al., 2018, arXiv 1707.05363, use (5, 5)). None lets any frame be replaced.
+        blocks: a pair of numbers of frames. After `start`, the first number of frames is kept, the second number may be
+            replaced, and so on in turns (Zhou et al., 2018, arXiv 1707.05363, use (5, 5)). With None, any frame may be
+            replaced.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -60,7 +61,9 @@ class ScheduledSampling:
 
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1) or self.start < 0:
-            raise ValueError(f"expected a probability in [0, 1], at least one pass and a start from 0, got {self}")
+            raise ValueError(
+                f"expected a probability in [0, 1], at least one pass and a start of at least 0, got {self}"
+            )
         if self.blocks is not None and (len(self.blocks) != 2 or min(self.blocks) < 1):
             raise ValueError(f"blocks must be numbers of kept and of replaced steps, at least 1, got {self.blocks}")
 
@@ -69,7 +72,7 @@ class ScheduledSampling:
         return replace(self, probability=level)
 
     def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
-        """Draw a mask (B, T, 1), True at frames that are replaced."""
+        """Draw a mask (B, T, 1), True at frames that the model's own means replace, for B sequences of T frames."""
         mask = torch.rand(batch, length, 1, device=device) < self.probability
         mask[:, : self.start] = False
         if self.blocks is not None:
@@ -113,7 +116,7 @@ class InputNoise:
 
 @dataclass(frozen=True)
 class Hidden:
-    """Entries of a data variable that the model may not read; it reads its own mean instead.
+    """Entries of a data variable that the model may not read; the model reads its own mean instead.
 
     Args:
         entries: (B, T, 1 or D), or (B, D) of a static variable.
@@ -127,7 +130,13 @@ class Hidden:
     fixed_frames: list[bool] | None = None
 
     def fill(self, value: Tensor, mean: Tensor, steps: int | slice = slice(None)) -> Tensor:
-        """Return the value (B, T, D) with the mean at these entries; for one step, both are (B, D)."""
+        """Return the value with the mean at these entries.
+
+        Args:
+            value: values of the variable, (B, T, D), or (B, D) for a single step.
+            mean: the model's means, of the same shape.
+            steps: steps of `value`, as an index or a slice of the T steps.
+        """
         if self.detached is not None:
             mean = torch.where(self.detached[:, steps], mean.detach(), mean)
         return torch.where(self.entries[:, steps], mean, value)
@@ -135,28 +144,28 @@ class Hidden:
 
 @dataclass
 class Rollout:
-    """A run of `factorization` over a batch.
+    """A run of a factorization over a batch: known values, and distributions and draws of the other variables.
 
     Args:
-        factorization: the factorization.
-        conditionals: name to `Conditional`.
+        factorization: factorization to run, generative or of the guide.
+        conditionals: dictionary from child to `Conditional`.
         batch, length: B and T.
         values: known values: data, context, statics (B, D) and, once they are known, latents (B, T, D).
         data: names of the observed variables.
         lengths: (B,) valid steps of a ragged batch.
-        observed: name to (B, T, D), True where an entry of the data was observed. At other entries, the model reads its
-            own mean and the guide reads 0.
-        present: name of a local latent to (B, T), False at steps at which it is integrated out. Its density does not
-            count there, and networks that read it also read this mask (`networks.base.presence`).
-        prefix: name to the first values (B, O, D) of a variable that the run continues.
+        observed: dictionary from data variable to (B, T, D), True where an entry was observed. At other entries, the
+            model reads its own mean and the guide reads 0.
+        present: dictionary from local latent to (B, T), False at steps at which it is integrated out. Its density does
+            not count there, and networks that read it also read this mask (`networks.base.presence`).
+        prefix: dictionary from variables that the run continues to their first values (B, O, D).
         mean_emission: names of data variables that are set to their means instead of drawn.
-        feeding: replacement for the data's history, or None.
+        feeding: replacement for the data's history, a `ScheduledSampling` or `InputNoise`; None keeps the history.
         draws: current number of rows per sequence of the data (`fork`).
         drawing: draw the entries that the model may not read, instead of using its means.
         groups: groups of sequences that share the `grouped` variables; None if each sequence is its own group.
         grouped: names of static latents that groups share.
         sums: structure of the sum over discrete latents, if there are any.
-        states: name to drawn values of discrete latents, for draws of their readers; densities ignore them.
+        states: dictionary from discrete latent to drawn values, which draws of its readers use and densities ignore.
     """
 
     factorization: Factorization
@@ -234,7 +243,7 @@ class Rollout:
         return self.conditional_distribution(name, draws)
 
     def conditional_distribution(self, name: str, draws: int = 1) -> TorchDistribution:
-        """Return the distribution of a variable given drawn states of the summed-out latents."""
+        """Return the distribution of a variable given drawn states of the summed-out latents; see `distribution`."""
         conditional = self.conditionals[name]
         if conditional.factor.local:
             return Sequence(self, name)
@@ -259,7 +268,15 @@ class Rollout:
         }
 
     def know(self, name: str, value: Tensor) -> None:
-        """Record the value of a site, which later sites read."""
+        """Record the value of a site, which later sites read.
+
+        Args:
+            name: name of the variable.
+            value: (B, T, D), or (B, D) of a static variable.
+
+        Raises:
+            ValueError: if variables in the same loop were drawn with another value.
+        """
         if name in self._draws and not _same(value, self._draws[name]):
             handed_out = self.values.keys() & self._draws.keys() & set(self._block[name].names)
             dependants = sorted(handed_out - {name})
@@ -287,11 +304,16 @@ class Rollout:
         return valid if mask is None else mask & valid
 
     def evaluate(self, name: str, value: Tensor) -> TorchDistribution:
-        """Return the conditionals of a local variable at all steps; batch shape (B, T, D), or (B, T)."""
+        """Return the conditional distributions of a local variable at all steps, batch shape (B, T, D) or (B, T).
+
+        Args:
+            name: name of the variable.
+            value: (B, T, D), values of the variable, whose past the factor may read.
+        """
         return self.conditionals[name].distribution(self.parameters(name, value))
 
     def parameters(self, name: str, value: Tensor) -> Parameters:
-        """Return the parameters (B, T, ...) for `evaluate`, memoized for one value."""
+        """Return the parameters (B, T, ...) of `evaluate`; the result for the last value is kept."""
         if not self._is_evaluated(name, value):
             history = self.history(name)  # this may run a loop that evaluates the variable
             if not self._is_evaluated(name, value):
@@ -361,7 +383,7 @@ class Rollout:
 
     @cached_property
     def _replacements(self) -> dict[str, Tensor]:
-        """Name to (B, T, D): the noisy data of the feeding; `history` adds the means block by block."""
+        """Dictionary from data variable to noisy data (B, T, D); `history` adds the model's means block by block."""
         noisy: dict[str, Tensor] = {}
         if not isinstance(self.feeding, InputNoise) or not self.feeding.scale:
             return noisy
@@ -413,7 +435,13 @@ class Rollout:
     def _run(
         self, block: Block, replacements: Mapping[str, Tensor] | None = None, hidden: Mapping[str, Hidden] | None = None
     ) -> dict[str, Tensor]:
-        """Return the unknown variables of a block; with `hidden`, its data with the model's means at those entries."""
+        """Draw the unknown variables of a block, or fill in hidden entries of its data, (B, T, D) by name.
+
+        Args:
+            block: variables that are computed in one loop over time.
+            replacements: values that the block reads in place of known ones.
+            hidden: entries of the block's data to replace by the model's means; None to draw the unknown variables.
+        """
         known = self.values.keys() | self.states.keys()
         live = [name for name in block.names if (name not in known if hidden is None else name in hidden)]
         values = {**self.known, **(replacements or {})}
@@ -507,7 +535,13 @@ class Rollout:
     def _known_steps(
         self, live: list[str], hidden: Mapping[str, Hidden] | None, values: Mapping[str, Tensor]
     ) -> list[bool]:
-        """Return for each step whether all values of a loop are known for every sequence."""
+        """Return for each step whether all values of a loop are known for every sequence.
+
+        Args:
+            live: names of the variables that the loop computes.
+            hidden: hidden entries of data by name, as in `_run`.
+            values: known values by name, (B, T, D).
+        """
         if any(name not in values for name in live):
             return [False] * self.length
         end = min(values[name].shape[1] for name in live)
@@ -522,7 +556,7 @@ class Rollout:
         return is_known + [False] * (self.length - end)
 
     def _continue(self, name: str, steps: int | slice, value: Tensor) -> Tensor:
-        """Return the known first values of a variable, with `value` at missing entries."""
+        """Return the known first values of a variable at some steps, with `value` at missing entries."""
         values = self.prefix[name][:, steps]
         return torch.where(self.observed[name][:, steps], values, value) if name in self.observed else values
 
@@ -565,7 +599,7 @@ class Sequence(TorchDistribution):
         return self.rollout.draw(self.name)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Draw as `rsample`, without a gradient; variables drawn in the same loop keep theirs."""
+        """Draw as `rsample`, without a gradient; variables drawn in the same loop keep their gradients."""
         return self.rsample(sample_shape).detach()
 
     def steps(self, value: Tensor) -> TorchDistribution:
@@ -597,7 +631,7 @@ class Sequence(TorchDistribution):
         return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Sequence:
-        """Return itself; a run has only one batch shape."""
+        """Return the distribution itself; any other batch shape raises an error."""
         if torch.Size(batch_shape) != self.batch_shape:
             raise NotImplementedError(
                 f"a Sequence of batch {tuple(self.batch_shape)} cannot be expanded to {tuple(batch_shape)}; "
@@ -635,7 +669,8 @@ class Marginal(Sequence):
     def steps(self, value: Tensor) -> TorchDistribution:
         """Raise an error: with states summed out, steps depend on one another."""
         raise NotImplementedError(
-            f"the variables that {self.name} reads are summed out, so its steps have no separate distributions"
+            f"{self.name} reads latents that are summed out, so its steps depend on one another and have no separate "
+            "distributions; use log_prob or by_step"
         )
 
     def by_step(self, value: Tensor) -> Tensor:
@@ -651,10 +686,15 @@ class Marginal(Sequence):
 
 
 def _runs(is_known: list[bool], direction: int) -> Iterator[tuple[int, int]]:
-    """Yield first step and number of steps of each joint evaluation in a loop.
+    """Yield the first step and the number of steps of each evaluation in a loop.
 
-    Forward in time, these are stretches of steps with all values known, together with the next step. Its parameters
-    read only known values and earlier draws at the same step.
+    Forward in time, consecutive steps with known values are evaluated together with the step after them. The parameters
+    of that step read only known values and earlier draws at the same step. Backward in time, each step is evaluated
+    alone.
+
+    Args:
+        is_known: for each step, whether its values are known.
+        direction: 1 if the loop runs forward in time, -1 if it runs backward.
     """
     if direction < 0:
         yield from ((t, 1) for t in reversed(range(len(is_known))))
@@ -681,10 +721,11 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
                     t, s = np.argwhere(ahead)[0] + 1
                     raise ValueError(
                         f"the mask {parent.relation} of {factorization.factor(name)} reads {parent.name}_{s} at t={t} "
-                        f"of {length} steps, drawn after {name}_{t}; a mask keeps its direction at every length"
+                        f"of {length} steps, but {parent.name}_{s} is drawn after {name}_{t}; the mask must have the "
+                        "same direction in time at every length"
                     )
 
 
 def _same(value: Tensor, drawn: Tensor) -> bool:
-    """Return whether a site's value is the draw: Pyro may return it detached."""
+    """Return whether a site's value equals the draw; tensors may differ, since Pyro may detach the draw."""
     return value is drawn or torch.equal(value, drawn)

@@ -100,10 +100,10 @@ class Ablation(Result):
         equations: equations of the model, "generative", and of the guide, "inference".
         sizes: sizes of the variables of the surrogates.
         steps: number T of time steps of the surrogates.
-        costs: {`AblatedEdge.run`: cost on each of the surrogates, in nats per sequence}.
-        notes: {`AblatedEdge.run`: reason why the reduced equations were not fitted, or latents on which no data depend
-            without the edge}.
-        comparison: comparison of the fitted models, `WHOLE` and one for each `AblatedEdge.run`; None without fits.
+        costs: dictionary from `AblatedEdge.run` to the cost on each surrogate, in nats per sequence.
+        notes: dictionary from `AblatedEdge.run` to the reason why the reduced equations were not fitted, or to the
+            latents on which no data depend without the edge.
+        comparison: comparison of the fitted models, named `WHOLE` or `AblatedEdge.run`; None without fits.
 
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{1:T})"
@@ -141,7 +141,7 @@ class Ablation(Result):
 
     @cached_property
     def differences(self) -> dict[str, Estimate]:
-        """{`AblatedEdge.run`: `METRIC` with all edges minus `METRIC` without the edge, in nats per frame}."""
+        """Dictionary from `AblatedEdge.run` to the loss of the `METRIC` without the edge, in nats per frame."""
         if self.comparison is None:
             return {}
         fitted_edges = [edge for edge in self.edges if edge.run in self.comparison.rows]
@@ -149,7 +149,10 @@ class Ablation(Result):
 
     @property
     def p_values(self) -> dict[str, float]:
-        """{`AblatedEdge.run`: p-value of no difference, adjusted for all edges}; NaN with a single seed or clip."""
+        """Dictionary from `AblatedEdge.run` to the p-value of the difference, adjusted for all edges (Holm).
+
+        A p-value is NaN with a single seed or clip.
+        """
         adjusted = holm([estimate.p_value() for estimate in self.differences.values()])
         return dict(zip(self.differences, map(float, adjusted), strict=True))
 
@@ -206,7 +209,7 @@ class Ablation(Result):
 
     @property
     def _frame(self) -> str:
-        """Name of a time step: bounds are per such step."""
+        """Word for a time step in units of bounds, such as "frame" in nats per frame; "" without fits."""
         return axis_names(self.comparison.data)[1] if self.comparison is not None else ""
 
     @property
@@ -224,12 +227,14 @@ class Ablation(Result):
         runs = {edge.run for edge in edges_of(self.generative, self.inference)}
         fitted_runs = set() if self.comparison is None else self.comparison.rows.keys() - {WHOLE}
         if self.costs.keys() != runs or not runs >= self.notes.keys() | fitted_runs:
-            raise ValueError("costs, notes or fits name edges that are not in the equations; give one cost per edge")
+            raise ValueError(
+                "`costs` must name exactly the edges of the equations, and `notes` and fits only these edges"
+            )
         counts = {len(costs) for costs in self.costs.values()}
         if len(counts) > 1 or not all(0 < count <= MOST for count in counts):
             raise ValueError(
-                f"the edges have {', '.join(map(str, sorted(counts)))} costs; every edge must have a cost on each of "
-                f"the same 1 to {MOST} surrogates"
+                f"every edge must have a cost on each of the same 1 to {MOST} surrogates, but the numbers of costs are "
+                f"{', '.join(map(str, sorted(counts)))}"
             )
         if not all(np.isfinite(costs).all() for costs in self.costs.values()):
             raise ValueError("costs must be finite")
@@ -249,7 +254,7 @@ def edge_of(part: Factorization, child: str, parent: Parent) -> AblatedEdge:
 
 
 def as_equations(method: Method | tuple[str, str], schema: Schema | None = None) -> Equations:
-    """Return a method as `Equations`, with networks of one kind and the options that both have.
+    """Return a method as `Equations`, with networks of one kind and those of its options that `Equations` has.
 
     Args:
         method: one of `FAMILY`, `equations`, or a pair of equations (generative, inference).

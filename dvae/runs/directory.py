@@ -90,7 +90,7 @@ class Loaded:
 
     @property
     def failed(self) -> bool:
-        """Whether the fit failed or has made no step."""
+        """Whether the fit failed, or has neither ended nor made a step."""
         state = Run(self.path).state
         return state["status"] == "failed" or (state["step"] == 0 and state["status"] not in ENDED)
 
@@ -105,7 +105,7 @@ class Loaded:
         return f"{self.path} has not ended ({reached}){initial}; {advice(self.path)}"
 
     def alike(self, other: Loaded) -> bool:
-        """Return whether another run was fitted on the same windows of the same data, regardless of its view."""
+        """Return whether another run was fitted on the same windows of the same data; the views may differ."""
         fingerprint, other_fingerprint = self.config.data.fingerprint, other.config.data.fingerprint
         return bool(fingerprint == other_fingerprint and self.schema.windows == other.schema.windows)
 
@@ -114,7 +114,7 @@ class Loaded:
 
         Args:
             path: path of the other data.
-            **changes: fields of the run's source to replace, such as missing=True.
+            **changes: fields of `config.data` to replace, such as missing=True.
 
         Raises:
             ValueError: the data have another schema, such as other joints.
@@ -129,7 +129,10 @@ class Loaded:
 
 
 def advice(path: str | os.PathLike[str]) -> str:
-    """Return advice to continue a run; after a failure at a lower learning rate, because the same steps would fail."""
+    """Return advice on how to continue a run.
+
+    After a failure the advice is a lower learning rate, because the same steps would fail again.
+    """
     run = Run(path)
     if run.state["status"] != "failed":
         return f"continue it with: dvae resume {path}"
@@ -158,7 +161,7 @@ def resume(
     Args:
         path: run directory.
         data: current path of the data, if the path in the run is no longer valid.
-        trackers: further receivers of the log's rows.
+        trackers: further trackers, which receive each row of the training log.
         callbacks: hooks of the training loop.
         **options: options of `Training` to change, such as steps=4000 for a longer run.
 
@@ -230,7 +233,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
         kind, schema_kind = source.pop("kind"), schema.pop("kind")
         if schema_kind != DATA[kind].schema_kind:
             raise ValueError(
-                f"data of the kind {kind!r} have a schema of the kind {DATA[kind].schema_kind!r}, got {schema_kind!r}"
+                f"data of kind {kind!r} require a schema of kind {DATA[kind].schema_kind!r}, got {schema_kind!r}"
             )
         return Config(
             configured(config["method"]),

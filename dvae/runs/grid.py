@@ -41,7 +41,7 @@ from ..options import nearest, tuples
 LARGEST = 2**20
 """Maximum size of a grid in bytes."""
 MOST = 1000
-"""Maximum number of methods in a grid, including all combinations of options, and of seeds."""
+"""Maximum number of methods in a grid, counting all combinations of options; also the maximum number of seeds."""
 NAME = r"\w[\w.=+-]{0,199}"
 """Pattern of the name of a run directory without its seed."""
 SEEDS, TRAINING, METHOD, EACH = "seeds", "training", "method", "each"
@@ -53,7 +53,7 @@ class Grid:
     """Content of a grid file.
 
     Attributes:
-        methods: {name: method with its options}.
+        methods: dictionary from the name of a run directory, without the seed, to the method with its options.
         seeds: seeds of the runs of each method; None if the file has none.
         training: training options that replace each method's defaults.
     """
@@ -95,14 +95,12 @@ class Grid:
         for name, table in document.items():
             if not isinstance(table, dict):
                 raise ValueError(
-                    f"{path}: {name} = {table!r} is in no table; only seeds and [training] apply to all runs"
+                    f"{path}: {name} = {table!r} is in no table; move it into [training] or the table of a method"
                 )
             try:
                 table_methods = _methods(name, table, options or {}, MOST - len(methods))
                 if duplicates := table_methods.keys() & methods.keys():
-                    raise ValueError(
-                        f"{min(duplicates)} is the name of another table's run; give one of them another name"
-                    )
+                    raise ValueError(f"two tables give a run the name {min(duplicates)}; rename one of the tables")
             except (TypeError, ValueError) as error:
                 raise ValueError(f"{path}, [{name}]: {error}") from error
             methods |= table_methods
@@ -119,7 +117,7 @@ def _training(options: Any) -> dict[str, Any]:
     """Return the checked training options of all runs.
 
     Raises:
-        TypeError, ValueError: `told` is not a table, or an option is unknown, wrong, or not available in a sweep.
+        TypeError, ValueError: `options` is not a table, or an option is unknown, wrong, or not available in a sweep.
     """
     if not isinstance(options, dict):
         raise ValueError(f"it must be a table of options such as steps, got {reprlib.repr(options)}")
@@ -133,7 +131,7 @@ def _training(options: Any) -> dict[str, Any]:
 
 
 def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], limit: int) -> dict[str, Method]:
-    """Return the methods of a table by name; at most `limit`."""
+    """Return a dictionary from name to method, for the methods of a table; raise an error above `limit` methods."""
     settings = {**options, **table}
     kind, variations = settings.pop(METHOD, EQUATIONS), settings.pop(EACH, {})
     if not isinstance(kind, str) or not isinstance(variations, dict):
@@ -146,7 +144,7 @@ def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], li
             raise ValueError(f"each.{option} has a value twice: {reprlib.repr(values)}")
         count *= len(values)
     if count > limit:
-        raise ValueError(f"{count} more methods exceed the maximum of {MOST} in a grid; leave some values out")
+        raise ValueError(f"{count} more methods would exceed the maximum of {MOST} in a grid; leave some values out")
     methods = {}
     for values in product(*variations.values()):
         varied = dict(zip(variations, values, strict=True))

@@ -36,15 +36,15 @@ class Dataset(Protocol):
     schema_kind: ClassVar[str]
     """Kind of the schema."""
     source: ClassVar[type[Any]]
-    """Type returned by `recorded`: a dataclass of JSON's types with at least a path and a fingerprint."""
+    """Type that `recorded` returns: a dataclass with JSON's types and at least the fields `path` and `fingerprint`."""
 
     @classmethod
     def open(cls, path: str, *, skip_bad: bool = False, **options: Any) -> Self:
-        """Read a file, with the options of this kind from the command line."""
+        """Read a file; `options` are those that the command line has for this kind of data."""
 
     @property
     def location(self) -> str:
-        """Path of the data that is valid in any process."""
+        """Path of the data that other processes can open, whatever their working directory."""
 
     @property
     def fingerprint(self) -> str:
@@ -58,7 +58,7 @@ class Dataset(Protocol):
         """Return the windows of "train", "validation" or "test"."""
 
     def recorded(self) -> Any:
-        """Return the source of the data, which a run stores."""
+        """Return the source of the data, such as path and fingerprint, which `config.json` of a run stores."""
 
     @classmethod
     def reopened(cls, source: Any, schema: Any, path: str | os.PathLike[str] | None = None) -> Self:

@@ -44,7 +44,7 @@ from .kinds import Dataset
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run of a sweep.
+    """Result of a run of a sweep.
 
     Args:
         path: run directory.
@@ -53,7 +53,7 @@ class Outcome:
         status: "finished", "stopped early", "interrupted" or "failed".
         step: last step.
         best_bound: best validation bound, in nats per frame, as in `Fit`.
-        best: best validation value and its step, in words.
+        best: text of the best validation value and its step.
         seconds: time that this sweep spent on the run; 0 if an earlier sweep finished it.
         error: message of the error, if the run failed.
     """
@@ -144,12 +144,12 @@ def sweep(
         for name, method in _by_name(methods).items()
     ]
     if not runs or len({run.path for run in runs}) < len(runs):
-        raise ValueError(f"a sweep needs at least one method and one seed, each once, got seeds {list(seeds)}")
+        raise ValueError(f"a sweep needs at least one method and one seed, without duplicates, got seeds {list(seeds)}")
     require(int, jobs=jobs)
     if not jobs:
         raise ValueError("jobs is 0; it must be the number of runs at a time, or -1 for one per core")
     if devices := [run.training.devices for run in runs if run.training.devices != 1]:
-        raise ValueError(f"devices is {devices[0]}; a run of a sweep has one device; for more, use dvae.fit")
+        raise ValueError(f"devices is {devices[0]}, but a run of a sweep uses one device; call dvae.fit for more")
     results = {run.path: result for run in runs if (result := _earlier_outcome(run)) is not None}
     pending = [run for run in runs if run.path not in results]
     notes: list[str] = []
@@ -173,7 +173,9 @@ def sweep(
     if stopped is not None:
         raise SweepInterrupted(outcomes, len(runs), getattr(stopped, "signal", signal.SIGINT))
     if misplaced := [result.path for result in outcomes if result.status in ENDED and not Run(result.path).exists]:
-        raise RuntimeError(f"a worker wrote {misplaced[0]} elsewhere; give a directory that all workers can access")
+        raise RuntimeError(
+            f"{misplaced[0]} is missing: its worker wrote to another disk; give a directory that all workers share"
+        )
     return outcomes
 
 
@@ -296,7 +298,7 @@ def _by_name(methods: Mapping[str, Method] | Sequence[Method]) -> dict[str, Meth
             labels = (f"z{v}" if n == "latent" else f"{n.replace('_', '-')}={v}" for n, v in varied.items())
             name = "-".join([method.name, *labels])
             if name in by_name:
-                raise ValueError(f"{name} is given twice; the methods of a sweep differ in their options")
+                raise ValueError(f"{name} is given twice; remove one, or change its options")
             by_name[name] = method
     for name in by_name:
         if not re.fullmatch(r"[\w.=+-]+", name):
@@ -390,7 +392,7 @@ class _Log:
 
 
 class _Progress:
-    """Progress of a sweep: a line when each run ends, and a live table, or without a terminal a line at each start."""
+    """Progress of a sweep: a line when a run ends, and a live table; without a terminal, a line when a run starts."""
 
     def __init__(self, runs: Sequence[_Run], visible: bool) -> None:
         self.console = PlainConsole(stderr=True, quiet=not visible, force_jupyter=False)

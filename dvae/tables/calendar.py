@@ -174,7 +174,7 @@ def _changes_clocks(times: np.ndarray) -> bool:
 
 
 def _step(local: Any) -> str | None:
-    """Return the calendar step of increasing dates; None if they have none or are too few."""
+    """Return the calendar step of increasing dates; None if the dates are too few or follow no calendar step."""
     if len(local) < 3 or not _is_daily(local):
         return None
     days = float(np.median(np.diff(seconds(local)))) / DAY
@@ -190,7 +190,7 @@ def _step(local: Any) -> str | None:
 
 
 def _following(local: Any, step: str, count: int) -> Any:
-    """Return the next `count` dates by a calendar step; None if most dates are not consecutive by it."""
+    """Return the next `count` dates by a calendar step; None if most given dates are not one such step apart."""
     import pandas as pd
 
     days = None

@@ -89,7 +89,7 @@ def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None)
 def join_times(frame: Any, names: tuple[str, ...]) -> Any:
     """Return the time of each row from several columns.
 
-    Without a year, days are counted.
+    Without a year, times are numbers in the unit of the last column.
 
     Args:
         frame: table.
@@ -122,8 +122,8 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
         units = [next(order) for _ in names]
     if skipped := [fine for coarse, fine in pairwise(SECONDS) if fine in units and coarse not in units]:
         raise ValueError(
-            f"{label} have a {skipped[0]} without the next larger unit; name a column for each unit, "
-            "from the year or day on"
+            f"{label} have a column of {skipped[0]}s but no column of the next larger unit; name a column "
+            "for each unit, from the year or day on"
         )
     parts = {str(unit): _part(frame[name], str(unit)) for unit, name in zip(units, names, strict=True)}
     seconds = sum(

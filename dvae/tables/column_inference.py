@@ -174,7 +174,7 @@ def _classes(values: Any, na_values: Collection[str]) -> tuple[str, ...]:
 
 
 def infer_columns(frame: Any) -> Columns:
-    """Propose a schema for a pandas frame in the long form.
+    """Propose a schema for a pandas frame in the long form, with one row per sequence and step.
 
     The rules are:
 
@@ -205,7 +205,7 @@ class _Inference:
         levels: names of columns that are levels of its index.
         times: columns of the time, if given.
         key_columns: columns of the given id, time, group and split.
-        families: given columns with their family, "" if none is given.
+        families: dictionary from given column to its family, "" if the family is not given.
     """
 
     def __init__(
@@ -267,7 +267,7 @@ class _Inference:
         return not TIMES.search(name.lower()) and bool(texts(values).str.fullmatch(r"0\d+").any())
 
     def _find_id_and_time(self, unassigned: list[str]) -> None:
-        """Choose the time with the fewest rows of a sequence at the same time; the first one among equals."""
+        """Choose the time column that gives the fewest duplicate times within a sequence; the first if several tie."""
         candidates = []
         for time in [self.time] if self.time else self._times(unassigned):
             try:
@@ -371,7 +371,7 @@ class _Inference:
         return 1 < runs == len(np.unique(codes)) < len(codes)
 
     def _coverage(self, ids: list[str], steps: np.ndarray) -> float:
-        """Return the mean share of steps with a row, from the first to the last step of a sequence."""
+        """Return the share of steps, from the first to the last of each sequence, that have a row."""
         import pandas as pd
 
         moments = pd.Series(steps)
@@ -517,7 +517,7 @@ class _Inference:
         return f"neither numbers nor 2 to {CLASSES} classes, such as {_first(unparsed)}{sign}"
 
     def warn(self, columns: Columns, all_named: bool) -> None:
-        """Warn of columns of the frame that the schema omits."""
+        """Warn about columns of the frame that the schema omits."""
         ambiguous = () if columns.time else self.undecided
         omitted = [name for name in self.frame if name not in columns.needed and (all_named or name in ambiguous)]
         descriptions = [f"{name!r} ({self.reason(name)})" for name in omitted]

@@ -41,9 +41,9 @@ from .calendar import check_zone
 
 Role = Literal["target", "known", "past", "static"]
 WHOLE_STEPS = ("correlated",)
-"""Families with one event for all their columns."""
+"""Families with one joint distribution over all their columns, whose values are observed or missing together."""
 MOST = 4096
-"""Maximum number of columns, and of classes of a column."""
+"""Maximum number of columns of a table, and of classes of a column."""
 _CHAIN = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"(?:\\.|[^"\\\n])*+"|'[^'\n]*+')\s*\.\s*){64}""")
 """A dotted key deeper than in any schema; `tomllib` takes quadratic time to parse it."""
 
@@ -98,7 +98,7 @@ class Column:
 
     @property
     def coordinates(self) -> list[str]:
-        """Names of its coordinates; a category has one for each class."""
+        """Names of the column's coordinates in x; a category has one for each class."""
         return [f"{self.name}={label}" for label in self.classes] or [self.name]
 
 
@@ -141,7 +141,7 @@ class Columns:
         if "" in (*names, self.group):
             raise ValueError("a column has no name; give it one")
         if len(names) > MOST:
-            raise ValueError(f"{len(names)} columns; at most {MOST} are read")
+            raise ValueError(f"the schema names {len(names)} columns; at most {MOST} are read, so leave some out")
         if not self.targets:
             raise ValueError(f"no column is a target among {', '.join(self.names[:20]) or 'none'}")
         if repeated := [name for name, count in Counter(names).items() if count > 1]:
@@ -278,7 +278,7 @@ def parsed(text: str) -> dict[str, Any]:
             raise RecursionError
         return tomllib.loads(text)
     except RecursionError:
-        raise ValueError("its tables are nested too deeply") from None
+        raise ValueError("its tables are nested too deeply; expected two levels, such as [columns.riders]") from None
 
 
 def layout(told: Mapping[str, Any]) -> dict[str, Any]:

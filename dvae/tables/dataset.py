@@ -143,7 +143,7 @@ class PanelData:
 
     def whole(self) -> PanelWindows:
         """Return all sequences, uncut."""
-        return self.recut(observed=None, horizon=None, split="sequence").windows("all")
+        return self.recut(observed=None, horizon=None, season=None, split="sequence").windows("all")
 
     @property
     def location(self) -> str:

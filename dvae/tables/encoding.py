@@ -54,8 +54,9 @@ class PanelSchema(Schema):
     Args:
         columns: schema of the table.
         cut: how sequences are split and cut.
-        means, scales: means and scales of the standardised columns, over the training data.
-        logarithms: smallest value, and mean and standard deviation of the logarithms, of columns read as logarithms.
+        means, scales: dictionaries from standardised column to its mean and scale over the training data.
+        logarithms: dictionary from column that models read as logarithm to its smallest positive value, and the mean
+            and standard deviation of its logarithms.
         with_missing: names of columns with an indicator: those with missing training values, or known only up to the
             present.
         step: median time between steps; 0 if steps are evenly spaced.
@@ -89,11 +90,13 @@ class PanelSchema(Schema):
         covariates = self.columns.of("known", "past", "static")
         if missing := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
             raise ValueError(
-                f"no mean and scale of {', '.join(sorted(missing))}; models need both to standardise values"
+                f"no mean and scale of {', '.join(sorted(missing))}; expected both for every real "
+                "covariate, as `PanelSchema.from_data` computes them"
             )
         if missing := {c.name for c in self.columns.of("past")} - {*self.with_missing}:
             raise ValueError(
-                f"no indicator of {', '.join(sorted(missing))}; covariates known up to the present need one"
+                f"no indicator of {', '.join(sorted(missing))}; add these covariates, known up to the present, to "
+                "`with_missing`"
             )
 
     @classmethod
@@ -122,8 +125,8 @@ class PanelSchema(Schema):
             elif column.family not in ("binary", "category") and varies and scale < RESOLVED * abs(mean):
                 raise ValueError(
                     f"column {column.name!r} has mean {mean:.9g} and standard deviation {scale:.3g}, which float32 "
-                    f"does not resolve in the family {column.family!r}; give it the family 'real', whose mean models "
-                    "subtract in float64"
+                    f"does not resolve in the family {column.family!r}; give it the family 'real'; models subtract "
+                    "the mean of real columns in float64"
                 )
             if column.family in SCALED:
                 means[column.name], scales[column.name] = 0.0, mean or 1.0
@@ -168,7 +171,7 @@ class PanelSchema(Schema):
     @property
     @override
     def view(self) -> View:
-        """The identity, with the context as optional inputs."""
+        """View that leaves x unchanged and offers the context as optional inputs."""
         return ContextView(tuple(name for name in self.sizes if name != "x"))
 
     @property
@@ -203,7 +206,7 @@ class PanelSchema(Schema):
     @property
     @override
     def together(self) -> Sequence[int]:
-        """Index of the column of each coordinate; all 0 if a step is observed or missing as a whole."""
+        """Index of the column of each coordinate; all 0 if every step is either fully observed or fully missing."""
         targets = enumerate(self.columns.targets)
         return [0 if is_whole(self.columns) else index for index, column in targets for _ in column.coordinates]
 
@@ -332,14 +335,14 @@ def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
 
 
 def _warn_of_levels(columns: Columns, means: Mapping[str, float], training: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Warn if float32 does not resolve how a column varies within a sequence, after the overall mean is subtracted."""
+    """Warn if a column varies within a sequence by less than float32 resolves after the mean is subtracted."""
     center = np.array([means.get(name, 0.0) for name in columns.names])
     imprecise = np.array([is_imprecise(ColumnSummary.of(blocks(values)), center) for _, values in training])
     for column, mean, sequences in zip(columns.columns, center, imprecise.T, strict=True):
         if sequences.any() and column.family not in ("binary", "category"):
             warnings.warn(
-                f"column {column.name!r} varies by less than float32 resolves at its distance from {mean:.9g} in "
-                f"{sequences.sum()} of {len(training)} training sequences, such as "
+                f"column {column.name!r} varies by less than float32 resolves, because its values are far from "
+                f"{mean:.9g}, in {sequences.sum()} of {len(training)} training sequences, such as "
                 f"{training[sequences.argmax()][0]!r}; {LEVELS}",
                 stacklevel=3,
             )
@@ -355,5 +358,5 @@ def _encode(values: np.ndarray, column: Column) -> np.ndarray:
 
 
 def is_whole(columns: Columns) -> bool:
-    """Return whether a step is always observed or missing as a whole."""
+    """Return whether every step is either fully observed or fully missing."""
     return any(column.family in WHOLE_STEPS for column in columns.targets)

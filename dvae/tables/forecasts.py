@@ -38,7 +38,7 @@ class PanelForecasts:
         draws: (K, N, H, D) of the coordinates.
         past: (N, O, D), observed values, NaN where missing.
         truth: (N, H, D), true futures, NaN where unknown.
-        columns: coordinate to its unit; a category has one coordinate per class, with its share.
+        columns: dictionary from coordinate to unit; a category has one coordinate per class, with its share.
         keys: (sequence, first step of the future) of each window.
         times: (N, O + H) of the steps, as in `Calendar`; None for step numbers.
         calendar: kind, time zone and calendar step of the times.
@@ -150,7 +150,7 @@ class PanelImputed:
     Args:
         draws: (K, N, T, D) of the coordinates; observed values are equal in all draws.
         missing: (N, T, D), True where a coordinate is missing.
-        columns: coordinate to its unit.
+        columns: dictionary from coordinate to unit.
         keys: (sequence, first step) of each window.
         times: (N, T) of the steps, as in `Calendar`; None for step numbers.
         calendar: kind, time zone and calendar step of the times.

@@ -54,7 +54,7 @@ class Numbers:
 
         Args:
             column: the column that was read.
-            how: additional remedy for the message.
+            how: end of the message, with a further remedy.
 
         Raises:
             ValueError: if cells are not numbers, or depend on the decimal sign.
@@ -161,7 +161,7 @@ def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[n
 
 
 def _has_large_whole(values: np.ndarray) -> bool:
-    """Return whether some number is an integer of three digits or more: 1.000 after 999 is no fraction."""
+    """Return whether some number is an integer of three digits or more; 1.000 next to it means 1000."""
     return bool(((np.abs(values) >= 100) & (values == np.trunc(values))).any())
 
 

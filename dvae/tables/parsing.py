@@ -113,7 +113,7 @@ def index_levels(data: Any) -> list[tuple[str, Any]]:
 
 
 def texts(column: Any) -> Any:
-    """Return the values as text, with missing ones missing; integers look alike with and without missing values."""
+    """Return the values as text and keep missing values; whole numbers have no decimal part, as in 7, not 7.0."""
     if column.dtype.kind == "f" and (numbers := column.dropna()).abs().lt(2**53).all() and (numbers % 1 == 0).all():
         column = column.astype("Int64")
     return column.astype(str).where(column.notna())
@@ -122,8 +122,8 @@ def texts(column: Any) -> Any:
 def dates(column: Any) -> Any:
     """Parse dates, in their time zone if they have one.
 
-    Accepted formats are ISO 8601, dates with English month names, and digits if some values determine day and month.
-    Dates with several offsets from UTC are converted to UTC.
+    Accepted formats are ISO 8601, dates with English month names, and numeric dates if some values determine the order
+    of day and month. Dates with several offsets from UTC are converted to UTC.
 
     Raises:
         AmbiguousDates: if the order of day, month and year is not determined, or only some dates have an offset.
@@ -223,10 +223,10 @@ def _as_iso(strings: Any) -> Any:
 
 
 def _order(parts: Any, example: str) -> dict[str, str]:
-    """Return which of two numbers is the day: a number above 12."""
+    """Return which of the first two numbers of dates is the day, the one with a value above 12."""
     first, second = (parts[name].astype(int).max() > 12 for name in ("first", "second"))
     if first and second:
-        raise ValueError(f"some begin with the day and others with the month; write dates as {DATE_EXAMPLE}")
+        raise ValueError(f"some dates begin with the day and others with the month; write dates as {DATE_EXAMPLE}")
     if not (first or second) or (parts.year.str.len() == 2).any():
         raise AmbiguousDates(
             f"dates such as {example!r} are ambiguous: the order of day, month and year is not known; "
@@ -285,7 +285,8 @@ def _localize(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, col
     """Return local times as moments in a zone.
 
     Raises:
-        ValueError: if a time is skipped by a clock change, or occurs twice and its sequence does not resolve it.
+        ValueError: if a local time is skipped by a clock change, or occurs twice and the neighbouring times do not show
+            which is meant.
     """
     is_repeated = local.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward").isna() & local.notna()
     moments = local.tz_localize(zone, ambiguous=np.ones(len(local), bool), nonexistent="NaT")
@@ -315,7 +316,7 @@ def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: s
 
     Args:
         column: (N,) of any type.
-        told: description of the column.
+        told: schema of the column, with its family and classes.
         na_values: further texts or numbers that mark missing values; a listed class remains a class.
         decimal: "." or ",", the decimal sign of texts.
 

@@ -25,7 +25,8 @@ class Cut:
         validation: share for validation.
         test: share for test.
         seed: random seed of the split by sequence or group.
-        season: period of the data in steps, such as 7 for days; the reference forecast "seasonal" repeats it.
+        season: period of the data in steps, such as 7 for daily data with a weekly period; the reference forecast
+            "seasonal" repeats it.
 
     Raises:
         ValueError: if only one of `observed` and `horizon` is given, `split` is "time" without them, the season exceeds
@@ -46,13 +47,17 @@ class Cut:
         if (self.observed is None) != (self.horizon is None):
             raise ValueError(f"observed is {self.observed} and horizon {self.horizon}; give both, or neither")
         if self.split == "time" and self.observed is None:
-            raise ValueError('split="time" needs windows; give the number of observed steps, and a horizon')
+            raise ValueError('split="time" needs windows; give the numbers of steps as observed and horizon')
         if self.season is not None and self.season > (self.observed or 0):
             raise ValueError(
-                f"season is {self.season} and observed {self.observed}; a period must be within the observed steps"
+                f"season is {self.season} and observed {self.observed}; season must be at most observed; shorten the "
+                "season, or observe more steps"
             )
         if self.validation + self.test >= 1:
-            raise ValueError(f"validation {self.validation} and test {self.test} leave nothing to train on")
+            raise ValueError(
+                f"validation is {self.validation} and test {self.test}; their sum must be below 1, so that data remain "
+                "for training"
+            )
 
     @property
     def length(self) -> int | None:

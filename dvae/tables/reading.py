@@ -57,8 +57,8 @@ LARGEST_HEADER = 2**20
 def read_frame(path: str | os.PathLike[str]) -> Any:
     """Read a CSV, TSV, Parquet or npz file as a pandas frame; cells of CSV and TSV are text, empty ones missing.
 
-    An npz contains an array (N, T, D), or (T, D) of one sequence, named "x" or as the only one, and optionally
-    "lengths" (N,). Its columns are x0, x1, …, "sequence" and "step".
+    An npz contains an array (N, T, D), or (T, D) for one sequence, and optionally "lengths" (N,). The array is named
+    "x", or it is the only one besides "lengths". Its columns are x0, x1, …, "sequence" and "step".
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -360,7 +360,7 @@ def _check_header(name: str, member: Any) -> None:
 
 
 def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | ColumnHints | None, Cut | None]:
-    """Return the content of the schema file next to a file, or None for each missing part.
+    """Return columns and cut of the schema file next to a file, as in `read_schema`; (None, None) without a file.
 
     Raises:
         ValueError: if the schema is invalid; the message names its file.
@@ -382,7 +382,7 @@ def read_schema(text: str) -> tuple[Columns | ColumnHints | None, Cut | None]:
     cut = entries.pop("cut", None)
     if cut is not None:
         if not isinstance(cut, dict):
-            raise ValueError("cut must be a table: [cut]")
+            raise ValueError(f"cut is {cut!r:.100}; expected a table, [cut]")
         allowed = [field.name for field in fields(Cut)]
         for name in cut:
             if name not in allowed:

@@ -206,7 +206,7 @@ class PanelWindows:
         return self._cut(indices, low + (u_start * (last - low + 1)).long())
 
     def _sample_groups(self, batch_size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return range and first step of windows of some groups, drawn in proportion to their number of windows."""
+        """Return range and first step of random windows; groups are drawn in proportion to their number of windows."""
         names = [self.panel.series[index].group for index, _, _ in self._ranges]
         cumulative = torch.cat([self._weights.new_zeros(1), self._weights])
         first = torch.tensor([n for n, name in enumerate(names) if n == 0 or names[n - 1] != name])
@@ -233,7 +233,7 @@ class PanelWindows:
     def batches(self, batch_size: int) -> Iterator[Any]:
         """Return an iterator over batches of the listed windows.
 
-        Windows of several lengths or of groups are loaded at once.
+        If sequences are whole or have groups, all windows are loaded into memory first.
         """
         if self.length is None or self.schema.columns.group:
             return Sequences(self.all()).batches(batch_size)
@@ -255,7 +255,9 @@ class PanelWindows:
         require(Count, samples=samples)
         observed, horizon = self.protocol.observed, self.protocol.horizon
         if observed is None or horizon is None:
-            raise ValueError("whole sequences have no future; cut them, with observed and horizon steps, to forecast")
+            raise ValueError(
+                "whole sequences have no future; to forecast, cut them into windows with `observed` and `horizon` steps"
+            )
         if self.skipped:
             warnings.warn(f"forecasts leave out {self.too_short}", stacklevel=2)
         batch = self.all()
@@ -312,7 +314,7 @@ class PanelWindows:
 
     @property
     def _stride(self) -> int:
-        """Steps between listed windows: as the protocol defines for test windows, else half a horizon."""
+        """Steps between starts of listed windows: the protocol's stride for test windows, otherwise half a horizon."""
         cut = self.schema.cut
         if cut.horizon is None:
             return 1
@@ -320,12 +322,12 @@ class PanelWindows:
 
     @property
     def _counts(self) -> Tensor:
-        """Number of windows in each range, at this stride."""
+        """Number of listed windows in each range of starts, at the stride `_stride`."""
         return (self._last - self._low) // self._stride + 1
 
     @cached_property
     def _windows(self) -> tuple[Tensor, Tensor]:
-        """Range and first step of the listed windows; all of them, or `some`."""
+        """Range and first step of each listed window; `some` restricts the list."""
         return self._list_windows()
 
     def _list_windows(self) -> tuple[Tensor, Tensor]:
@@ -375,8 +377,8 @@ class PanelWindows:
     def _group_ids(self, ranges: list[int], starts: list[int]) -> list[int]:
         """Return the group of each window.
 
-        Outside training, only windows with the same present share a group. Otherwise one window could reveal the future
-        of another.
+        Outside training, only windows whose last observed steps have the same time share a group.
+        Otherwise one window could reveal the future of another.
         """
         observed, group_ids, numbers = self.schema.cut.observed, [], dict[Any, int]()
         for index, start in zip(ranges, starts, strict=True):

@@ -37,17 +37,20 @@ from .device import SameNoise, move, on_device
 
 
 class FactorizationContract:
-    """Properties of a `DynamicalVAE`: subclass it, with a name that pytest collects, and implement `build`.
+    """Tests of the properties of a `DynamicalVAE`.
+
+    Subclass this class, with a name that pytest collects, and implement `build`.
 
     Attributes:
         batch: number B of sequences in a test.
         steps: number T of time steps in a test.
         tolerance: maximum difference of log densities between two ways of running the program, in nats.
-        still: names of parameters that need not have a gradient from every batch.
-        missing: dependencies of the posterior that the published guide ignores, {} if it is exact; not checked if None.
+        still: names of parameters whose gradient may be zero for some batches.
+        missing: dependencies of the posterior that the published guide ignores, {} if it is exact; None skips the
+            check.
         training_steps: number of optimiser steps in the test that trains.
-        waits: maximum number of synchronisations of a bound and its gradient with a GPU; 1 if only the check of the
-            batch synchronises. Not checked if None.
+        waits: maximum number of synchronisations with a GPU in the computation of a bound and its gradient; 1 if only
+            the check of the batch synchronises, None to skip the check.
     """
 
     batch = 3
@@ -87,7 +90,7 @@ class FactorizationContract:
             yield
 
     def test_networks_read_the_declared_parents_and_nothing_else(self) -> None:
-        """The Jacobian of the parameters at t by a parent at s is exactly zero where the mask is False."""
+        """The Jacobian of the parameters at t with respect to a parent at s is exactly zero where the mask is False."""
         model = self._model()
         values = self._data(model, 1, names=model.sizes)
         for conditional in (*model.generator.values(), *model.encoder.values()):
@@ -114,7 +117,7 @@ class FactorizationContract:
         self._close(draw_logs, _run(poutine.condition(model.guide, data=latents), data)[1])
 
     def test_the_log_joint_is_that_of_the_per_step_program(self) -> None:
-        """One site per variable has the log density of a loop over time with one site per step."""
+        """Log densities of the program equal those of a loop over time with one site per variable and step."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)
@@ -134,7 +137,7 @@ class FactorizationContract:
         self._close({"joint": torch.stack(joints).logsumexp(0)}, {"joint": vectorised})
 
     def test_a_sequence_scores_the_same_whatever_is_beside_it(self) -> None:
-        """Other sequences of a batch have no effect, in training mode too, and scoring changes no buffer or mode."""
+        """A score does not depend on other sequences, also in training mode, and scoring changes no buffer or mode."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)
@@ -158,7 +161,7 @@ class FactorizationContract:
         assert all(torch.isfinite(value).all() for value in model.forecast(observed, 1).values())
 
     def test_padding_changes_nothing(self) -> None:
-        """Every sequence of a ragged batch scores as it does alone, for any values at the padded steps."""
+        """A sequence in a ragged batch has the same log density as alone, whatever the values at padded steps."""
         model = self._model()
         lengths = torch.arange(self.batch) % self.steps + 1
         data = self._data(model)
@@ -179,7 +182,7 @@ class FactorizationContract:
             self._close({name: log[i : i + 1] for name, log in guide_logs.items()}, guided)
 
     def test_missing_entries_leave_the_likelihood(self) -> None:
-        """A mask that hides nothing changes nothing; hidden data have likelihood 1 for any values."""
+        """A mask without missing entries changes no log density; missing data have log-likelihood 0 for any values."""
         model = self._model()
         data = self._data(model)
         latents, guided = _run(model.guide, data)
@@ -194,7 +197,7 @@ class FactorizationContract:
         assert all((terms.log_likelihood[name] == 0).all() for name in names)
 
     def test_the_gradient_is_that_of_the_bound(self) -> None:
-        """With the same noise, the gradient matches a finite difference of the bound, with missing entries too."""
+        """With the same noise, the gradient matches a finite difference of the bound, also if entries are missing."""
         model = self._model()
         data: Any = self._data(model)
         names = [name for name in model.observed if self._local(model, name)]
@@ -225,7 +228,7 @@ class FactorizationContract:
         assert not flat - self.still, f"no gradient reaches {', '.join(sorted(flat - self.still))}"
 
     def test_a_loaded_model_gives_the_same_seeded_draws(self, tmp_path: Path) -> None:
-        """Saved weights determine the model."""
+        """A model that loads saved weights gives the same draws for the same seed as the saved model."""
         model, other = self._model(), self._model()
         save_weights(model, tmp_path / "weights.safetensors")
         load_weights(other, tmp_path / "weights.safetensors")
@@ -237,7 +240,7 @@ class FactorizationContract:
             assert all(torch.equal(value, expected[name]) for name, value in run(other).items())
 
     def test_a_bound_stays_on_its_device(self) -> None:
-        """On a simulated GPU the bound equals the CPU's, and a second evaluation copies nothing to the device."""
+        """A simulated GPU gives the same bound as the CPU, and a second evaluation copies nothing to the GPU."""
         model = self._model()
         data = self._data(model)
         torch.manual_seed(1)
@@ -278,7 +281,7 @@ class FactorizationContract:
         self._close(results[1], results[0])
 
     def test_the_audit_says_what_is_published(self) -> None:
-        """The guide ignores exactly the dependencies of the exact posterior in `missing`."""
+        """The dependencies of the exact posterior that the guide ignores are exactly those in `missing`."""
         if self.missing is None:
             pytest.skip("missing is None: no published dependencies to compare with")
         model = self.build(1)
@@ -304,7 +307,7 @@ class FactorizationContract:
         assert (gap < 1e-6) == exact, f"the audit returns exact={exact}, but the best guide's gap is {gap:.2g} nats"
 
     def test_the_evidence_lies_between_its_annealed_bounds(self) -> None:
-        """On draws of the model, the average bound from the guide is below the bound from the true latents."""
+        """On draws of the model, the mean bound is lower if annealing starts at the guide than at the true latents."""
         model, count = self._model(), 8
         if not model.latents or not model.likelihood:
             pytest.skip("no latents are drawn, or the data are functions of them")
@@ -338,7 +341,10 @@ class FactorizationContract:
     def _sums_to_the_evidence(
         self, pair: DynamicalVAE, oracle: Oracle, data: dict[str, Tensor], draws: int = 500
     ) -> None:
-        """With states summed out, importance weights from a widened posterior average to the evidence."""
+        """For a model with states summed out, check that importance weights average to the evidence.
+
+        The proposal is the exact posterior with a larger covariance.
+        """
         mean, covariance = oracle.posterior(data)
         distribution = torch.distributions.MultivariateNormal(mean, 1.5 * covariance) if pair.latents else None
         samples = (
@@ -363,7 +369,7 @@ class FactorizationContract:
         return self.build(size).double().eval()
 
     def _data(self, model: DynamicalVAE, batch: int = 0, steps: int = 0, names: Any = ()) -> dict[str, Tensor]:
-        """Return random values of data and context, or of `names`; data with a support are drawn from the model."""
+        """Return random values of data and context, or of `names`; data of limited support are drawn by the model."""
         batch, steps = batch or self.batch, steps or self.steps
         values = {
             name: torch.randn(batch, *([steps] * self._local(model, name)), model.sizes[name], dtype=torch.float64)
@@ -376,7 +382,7 @@ class FactorizationContract:
         return values
 
     def _mask(self, model: DynamicalVAE, name: str, values: Tensor) -> Tensor:
-        """Return a random mask of the data, with all or none of the coordinates of one event."""
+        """Return a random mask of the data, which shows or hides all coordinates of an event together."""
         mask = torch.rand_like(values) < 0.6
         for event in map(list, model.generator[name].events):
             mask[..., event] = mask[..., event[:1]]
@@ -387,7 +393,7 @@ class FactorizationContract:
         return (model.generative if generative else model.inference).local(name)
 
     def _reads(self, conditional: Conditional, values: Mapping[str, Tensor], name: str) -> Tensor:
-        """Return where the parameters depend on the parent, (T or 1, S or 1)."""
+        """Return a matrix (T or 1, S or 1), True where the parameters at step t depend on the parent at step s."""
 
         def parameters(value: Tensor) -> Tensor:
             out = torch.cat(conditional({**values, name: value}, 1, self.steps), dim=-1)

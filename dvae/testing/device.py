@@ -67,7 +67,9 @@ class OnDevice(Tensor):
     @classmethod
     @override
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        raise RuntimeError(f"{func} of a tensor on {cls.device}, which exists only in a block of on_device()")
+        raise RuntimeError(
+            f"{func} of a tensor on {cls.device}, which exists only in a block of on_device(); call it there"
+        )
 
 
 class Traffic(TorchDispatchMode):
@@ -150,7 +152,7 @@ class _Moves(TorchFunctionMode):
             return self._move(func, args[0], [*args[1:], *kwargs.values()])
         if func in (Tensor.numpy, Tensor.__array__, Tensor.tolist) and isinstance(args[0], OnDevice):
             if func is not Tensor.tolist:
-                raise TypeError(f"a tensor on {OnDevice.device} has no array; move it to the CPU first")
+                raise TypeError(f"a tensor on {OnDevice.device} cannot become an array; move it to the CPU first")
             self.traffic.reads.append(_origin("tolist"))
             return args[0].own.tolist()
         before, self.traffic.within = self.traffic.within, any(isinstance(value, OnDevice) for value in _tensors(args))

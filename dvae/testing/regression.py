@@ -14,11 +14,13 @@ decouple them (another network uses its random numbers in another order), or opp
 Adding squared standard errors would be correct only in the second case. With a single stream of random numbers, one
 additional number would couple draw k to draw k - 1, and the d_k to each other.
 
-If d is skewed upwards, K draws often miss its tail, and t is too often low. An example is a sampled KL, whose draws
-have a long lower tail, that becomes analytic. t is then also compared with the t of K log-normal draws. Their log-scale
-is the smallest one, up to 1.5, at which a sample skewness as low as the skewness of d has probability .05. The test
-thus assumes that d is not more skewed than these log-normal draws. Simulated rates of false alarms at alpha = .001 are
-at most .003 from 20 draws on; with Student's t alone, the rate is .12.
+If the distribution of d is skewed upwards, K draws often contain no value of its upper tail. Then mean(d) and sd(d) are
+too low, t is far below 0, and the test fails too often. This happens, for example, after a change from a sampled KL
+term to an analytic one: old bounds have a long lower tail, new bounds do not, so d has a long upper tail. If the d_k
+are skewed upwards, t is therefore also compared with the t of K log-normal draws. Their log-scale is the upper 95 %
+confidence limit given the sample skewness of d, and at most 1.5. The test thus assumes that d is not more skewed than
+these log-normal draws. The simulated rate of false alarms at alpha = .001 is at most .003 from 20 draws on; with
+Student's t alone, it is .12.
 
 A loss of delta nats is detected with probability 1 - beta if delta = (t_{1-alpha} + t_{1-beta}) sd(d) / sqrt(K). Four
 times as many draws halve delta. With 20 draws the skewness of d is uncertain, and delta is twice as large.
@@ -64,7 +66,7 @@ class Record:
         bound: means over draws, (B,).
         error: Monte Carlo standard errors of `bound`, (B,).
         draws: means over sequences, (K,).
-        data: {name: shape, root mean squares and checksums of the data}, as in `checksums`.
+        data: dictionary from variable name to shape, root mean squares and checksums, as `checksums` returns it.
     """
 
     bound: Floats
@@ -119,7 +121,9 @@ class Record:
         except (KeyError, TypeError, AttributeError, ValueError) as problem:
             raise ValueError(f"not a record of bounds: {problem!r}") from problem
         if len(draws) != stored.get("particles") or len(draws) < 2:
-            raise ValueError(f"not a record of bounds: {len(draws)} draws of {stored.get('particles')} particles")
+            raise ValueError(
+                f"not a record of bounds: it has {len(draws)} draws, but its 'particles' is {stored.get('particles')}"
+            )
         return cls(bound, error, draws, data)
 
 
@@ -129,7 +133,7 @@ class Change:
 
     Args:
         old, new: records to compare.
-        alpha: probability of calling an unchanged model worse (or better).
+        alpha: significance level, the probability that an unchanged model is reported as worse (or as better).
     """
 
     old: Record
@@ -148,7 +152,7 @@ class Change:
 
     @property
     def p_worse(self) -> float:
-        """Probability of a difference this low if the bound has not fallen."""
+        """p-value: probability of this difference or a lower one if the expected bound has not changed."""
         return self._p(1)
 
     @property
@@ -191,15 +195,15 @@ class Change:
 
 @dataclass
 class ElboRegression:
-    """Fixture `elbo_regression`.
+    """Value of the pytest fixture `elbo_regression`; `check` compares the bound of a model with a record.
 
     Args:
         folder: folder of the test's records.
-        test: name of the test, and of its record unless `check` gives another.
-        update: whether to renew records.
-        strict: whether a missing record is a failure.
+        test: name of the test, which is also the name of its record unless `check` gives another.
+        update: whether to replace existing records by new ones.
+        strict: whether the test fails if its record is missing.
         note: function that adds a line to the terminal summary.
-        owners: {file: test whose record it contains}, for the records read or written so far.
+        owners: dictionary from the file of each record read or written so far to the test that uses it.
     """
 
     folder: Path
@@ -283,11 +287,13 @@ class ElboRegression:
             ) from problem
         if len(old.draws) != len(new.draws):
             raise ValueError(
-                f"{_relative(path)} is of {len(old.draws)} particles, not of {len(new.draws)}: bounds cannot be "
+                f"{_relative(path)} has {len(old.draws)} particles, the test {len(new.draws)}: bounds cannot be "
                 f"paired; pass particles={len(old.draws)}, or run with --update-elbo"
             )
         if other := _data_difference(old.data, new.data):
-            raise ValueError(f"{_relative(path)} is of other data: {other}; give the same, or run with --update-elbo")
+            raise ValueError(
+                f"{_relative(path)} was made with other data: {other}; give the same, or run with --update-elbo"
+            )
         change = Change(old, new, alpha)
         if change.worse:
             raise AssertionError(
@@ -340,7 +346,7 @@ def _bound(model: Callable[..., Any], guide: Callable[..., Any], data: Any) -> A
 def _check_bound(bound: Any, data: Any) -> Floats:
     sizes = {len(value) for _, value in _leaves(data) if value.ndim}
     if not isinstance(bound, Tensor) or bound.dim() != 1 or len(bound) not in sizes:
-        shape = tuple(bound.shape) if isinstance(bound, Tensor) else "without an observed site"
+        shape = tuple(bound.shape) if isinstance(bound, Tensor) else "no tensor, as no site is observed"
         raise ValueError(
             f"the bound is {shape}, expected one for each sequence; data have {sorted(sizes)} rows. Sequences belong "
             "in the rightmost plate: pyro.plate('sequences', B, dim=-1)"
@@ -407,7 +413,7 @@ def _t_and_skewness(draws: Floats) -> tuple[Floats, Floats]:
 
 @cache
 def _log_normal_reference(count: int, sets: int = 10_000) -> tuple[Floats, Floats]:
-    """Return the .05 quantile of skewness (S,) and the sorted t statistics (S, sets) of log-normal draws, by scale."""
+    """Return the .05 quantile of skewness (S,) and sorted t statistics (S, sets) of log-normal draws at S scales."""
     noise = np.random.default_rng(0).normal(size=(sets, count))
     scales = np.linspace(0.1, 1.5, 8)
     t, skewness = zip(*(_t_and_skewness(np.exp(s * noise) - math.exp(s**2 / 2)) for s in scales), strict=True)

@@ -148,7 +148,7 @@ def _exact(model: DynamicalVAE, data: Mapping[str, Any], latents: Mapping[str, A
         ValueError: when a latent is missing, or has another shape.
     """
     if missing := [name for name in model.latents if name not in latents]:
-        raise ValueError(f"reverse chains need start values of all latents; missing are {', '.join(missing)}")
+        raise ValueError(f"`latents` must have a start value for every latent; missing are {', '.join(missing)}")
     first = data[model.observed[0]]
     values = {}
     for name in model.latents:
@@ -175,7 +175,7 @@ class _Annealing:
         self.scale = flat.flatten(0, 1).std(0).clamp(min=1e-6).repeat(chains, 1)
 
     def step_sizes(self) -> dict[int, Tensor]:
-        """Return step sizes (B,) for each temperature, tuned by separate chains."""
+        """Return step sizes (B,) by index of the temperature, tuned on chains that are not used for the bound."""
         points = self._flattened(self.model.guide(self.data))
         step, step_sizes = points.new_full((len(points) // self.chains,), FIRST), {}
         for level in self.levels:
@@ -187,7 +187,13 @@ class _Annealing:
     def run(
         self, step_sizes: Mapping[int, Tensor], start: Mapping[str, Tensor] | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return bound, error, effective number of chains and acceptance rate, (B,) each; reverse if `start`."""
+        """Run the chains and return bound, error, effective number of chains and acceptance rate, (B,) each.
+
+        Args:
+            step_sizes: step sizes (B,) by index of the temperature, from `step_sizes`.
+            start: exact latents (B, ...) by name, from which chains run back to the guide; None for chains that start
+                at draws from the guide.
+        """
         back = start is not None
         points = self._flattened(self.model.guide(self.data) if start is None else repeat(start, self.chains))
         weights, rates = points.new_zeros(len(points)), []
@@ -236,7 +242,12 @@ class _Annealing:
         return points, acceptance.unflatten(0, (self.chains, -1)).mean(0), weight
 
     def _slope(self, points: Tensor, inverse: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return log f_b (R,), its gradient (R, N), and log p(x, z) - log q(z | x), (R,)."""
+        """Return log f_b (R,), its gradient (R, N), and log p(x, z) - log q(z | x), (R,).
+
+        Args:
+            points: latents as flat vectors, (R, N).
+            inverse: b, an inverse temperature.
+        """
         # cuDNN has no gradients of recurrent networks in evaluation mode
         with torch.enable_grad(), torch.backends.cudnn.flags(enabled=False):
             points = points.detach().requires_grad_()

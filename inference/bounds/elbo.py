@@ -37,8 +37,8 @@ class Terms:
     """Terms of a bound, per sequence and in nats.
 
     Args:
-        log_likelihood: log-likelihood (B,) of each data variable; for a view that changes volume, also the
-            log-determinant.
+        log_likelihood: log-likelihood (B,) of each data variable, including the log-determinant of a view that changes
+            volume.
         kl: KL (B,) of each latent, summed over the steps of a local one.
         energies: energy (B,) of each penalty (a `pyro.factor` site), positive if it costs.
         frames: number of valid steps, (B,).
@@ -80,8 +80,9 @@ class SequenceELBO(ELBO):
     It can be used like any Pyro ELBO; `terms` returns it by variable and sequence. The KL of a latent is analytic per
     step if both conditionals are normal and no generative parent of the latent is its descendant in the guide.
     Otherwise it is the log-ratio at the draw, which is unbiased for every guide. (For a backward guide the analytic
-    form is wrong: it keeps parents fixed that vary with the latent.) Parents depend on the data of the run: where x is
-    missing or replaced in scheduled sampling, the model reads its own mean, which varies with the parents of x.
+    form is wrong: it keeps parents fixed that vary with the latent.) Parents are determined for the data of each run:
+    where x is missing, or replaced in scheduled sampling, the model reads its own mean, which varies with the parents
+    of x.
 
     It traces like `TraceMeanField_ELBO` and agrees with it where that is correct. It evaluates each conditional only
     once, as it does not compute the trace's own log probability.
@@ -117,7 +118,7 @@ class SequenceELBO(ELBO):
         return draws[0] if len(draws) == 1 else _mean(draws)
 
     def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
-        """Return minus the bound plus the energies, summed over the batch."""
+        """Return the energies minus the bound, summed over the batch."""
         draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
         return sum(sum(t.energies.values()) - t.bound for t in draws).sum() / self.num_particles  # type: ignore[return-value, union-attr]
 
@@ -141,7 +142,10 @@ class SequenceELBO(ELBO):
         model_sites, guide_sites = map(sites_of, self._get_trace(model, guide, args, kwargs))
         for name in guide_sites:
             if name not in model_sites:
-                raise ValueError(f"the latent {name} is in the guide but not in the model")
+                raise ValueError(
+                    f"the latent {name} is in the guide but not in the model; "
+                    "add it to the model, or remove it from the guide"
+                )
         closed = _closed_forms(model_sites, guide_sites)
         terms = Terms({}, {}, {}, torch.empty(0))
         for name, site in model_sites.items():
@@ -159,7 +163,9 @@ class SequenceELBO(ELBO):
             elif site["is_observed"]:
                 _record(terms, terms.log_likelihood, name, site_log_prob(fn, value), run)
             else:
-                raise ValueError(f"the latent {name} is in the model but not in the guide")
+                raise ValueError(
+                    f"the latent {name} is in the model but not in the guide; add a sample site {name} to the guide"
+                )
         values = [*terms.log_likelihood.values(), *terms.kl.values(), *terms.energies.values()]
         if values and not len(terms.frames):  # no variable has steps, so each sequence counts once
             terms.frames = torch.ones_like(values[0])
@@ -203,12 +209,18 @@ def log_densities(trace: Any) -> dict[str, Tensor]:
 
 
 def total(logs: Mapping[str, Tensor]) -> Tensor:
-    """Return the sum over variables and steps, (B,)."""
+    """Return the sum (B,) of log densities (B, T) or (B,) over variables and steps."""
     return sum(log.sum(-1) if log.dim() == 2 else log for log in logs.values())  # type: ignore[return-value]
 
 
 def joint_and_guide(model: DynamicalVAE, batch: AnyBatch, latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return log p(x, z) and log q(z | x) at these latents, (B,) each."""
+    """Return log p(x, z) and log q(z | x) at given latents, (B,) each.
+
+    Args:
+        model: model with its guide.
+        batch: batch as in `DynamicalVAE.model`.
+        latents: values of all latents by name, (B, T, D) or (B, D) each.
+    """
     traces = (
         poutine.trace(poutine.condition(program, data=dict(latents))).get_trace(batch)
         for program in (model.model, model.guide)

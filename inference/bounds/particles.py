@@ -55,7 +55,7 @@ def fivo_bound(
 
     exp(bound) is unbiased for p(x) with any number of particles, so on average the bound rises with their number to the
     log evidence. With one particle it is the evidence lower bound at one draw. Without resampling it is the IWAE bound,
-    which it exceeds on long sequences unless the guide is nearly exact (docs/bounds.md).
+    which it exceeds on long sequences unless the guide is nearly exact (docs/explanation/bounds.md).
 
     Resampling is systematic. Static latents are drawn first and resampled with their particle. Several local latents
     are drawn in the guide's order within each step.
@@ -121,7 +121,11 @@ class Filter:
         self.paths = {name: Rows([None] * self.known.length) for name in (*self._local(model.latents), *self.hidden)}
 
     def run(self, resample_below: float) -> FIVOBound:
-        """Run all steps. Afterwards `drawn` contains the draws of the surviving particles."""
+        """Run all steps and return the bound; afterwards `drawn` contains the draws of the surviving particles.
+
+        Args:
+            resample_below: share of the particles; the effective sample size below which they are resampled.
+        """
         model, length, batch = self.model, self.known.length, self.known.batch
         shape = self.particles, batch
         log_weights = self._draw_statics(late=False).view(shape)
@@ -186,7 +190,16 @@ class Filter:
         data: Mapping[str, Rows],
         masks: Mapping[str, Rows | None],
     ) -> Tensor:
-        """Draw the latents at t, and return the log weights (N,) of the step."""
+        """Draw the latents at a step from the guide, and return the log weights (N,) of the step.
+
+        Args:
+            t: index of the step, from 0.
+            guide: conditionals of the guide by local latent.
+            prior: conditionals of the model by local variable.
+            noise: noise (N, D) by step for each local latent.
+            data: data by name and step.
+            masks: masks of observed entries by name and step; None if all were observed.
+        """
         total = like(self.model).new_zeros(len(self.sequence))
         history = {**data, **self.paths}
         for name, distribution in guide.items():
@@ -223,7 +236,12 @@ class Filter:
         return total
 
     def _parameters(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Parameters:
-        """Return the parameters (N, D) of a static variable."""
+        """Return the parameters (N, D) of a static variable for all particles.
+
+        Args:
+            conditional: conditional of the variable.
+            shared: values by name that all particles of a sequence share, (B, ...).
+        """
         parents, size, lengths, rows = self._known_parents(conditional, shared)
         return tuple(pick(p, rows) for p in conditional(parents, size, self.known.length, lengths))
 

@@ -71,13 +71,13 @@ def predictive_bound(
         if particles < 1 or not first <= observed < length:
             context_frames = model.view.past
             raise ValueError(
-                f"expected at least 1 particle, and observed steps from {context_frames + first} to "
-                f"{context_frames + length - 1}; got {particles} and {context_frames + observed}"
+                f"`particles` must be at least 1, and `observed` must be from {context_frames + first} to "
+                f"{context_frames + length - 1}; got particles={particles} and observed={context_frames + observed}"
             )
         log_det = torch.zeros(size, length) if data.log_det is None else data.log_det
         if log_det.dim() == 1:
             raise ValueError(
-                "the view changes the volume of whole sequences, and the share of the future in it is not known; "
+                "the view has one log-determinant for a whole sequence, so the part of the future is unknown; "
                 "omit the log score, or return log_det by entry, (B, T, D), from the view"
             )
         past = data.map(lambda value: value[:, :observed] if value.dim() == 3 else value)

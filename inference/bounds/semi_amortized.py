@@ -54,9 +54,10 @@ class Link:
 
     Args:
         parent: name of the latent that is read.
-        to, of: indices (P,) among the S steps, in order, and steps of the parent, 0 for a static one.
-        weight: weights (B, P, E, D), in units.
-        centre, deviation: mean and standard deviation (B, P, E) of the values that are read.
+        to, of: steps (P,) of P pairs: step `to[p]` of the latent reads step `of[p]` of the parent. `to` increases, and
+            indexes the S steps; `of` is 0 for a static parent.
+        weight: weights (B, P, E, D) of a parent of dimension E and a latent of dimension D, for standardised values.
+        centre, deviation: mean and standard deviation (B, P, E) that standardise the values of the parent.
     """
 
     parent: str
@@ -67,7 +68,7 @@ class Link:
     deviation: Tensor
 
     def moves(self, values: Sequence[Tensor], steps: int) -> Tensor:
-        """Return shifts (k, B, S, D) in units, from values (k B, E) of the parent by step."""
+        """Return shifts (k, B, S, D) of the latent's location in its units, from values (k B, E) per parent step."""
         inputs = torch.stack([values[s] for s in self.of.tolist()], 1).unflatten(0, (-1, len(self.weight)))
         inputs = (inputs - self.centre) / self.deviation
         if steps == 1:
@@ -91,10 +92,10 @@ class Correction:
     """Correction of a conditional of the guide at S steps (1 for a static latent), for B sequences.
 
     Args:
-        unit: standard deviations (B, S, D).
+        unit: standard deviations (B, S, D) of the guide before the correction.
         shift: shift (B, S, D) of the location, in units.
         stretch: shift (B, S, D) of the logarithm of the scale.
-        links: links to latents that are read.
+        links: linear terms by which the location depends on draws of other latents, one for each latent.
     """
 
     unit: Tensor
@@ -134,7 +135,7 @@ class Correction:
         return [(self.shift, 1), (self.stretch, 1), *linked]
 
     def freed(self, change: Callable[[Tensor], Tensor]) -> Correction:
-        """Return a copy with changed free parameters."""
+        """Return a copy in which `change` has been applied to each free parameter."""
         links = tuple(replace(link, weight=change(link.weight)) for link in self.links)
         return replace(self, shift=change(self.shift), stretch=change(self.stretch), links=links)
 
@@ -220,7 +221,8 @@ def semi_amortized_guide(
         missing: whether the guide also reads, in its order of drawing, the latents that it ignores although the
             posterior depends on them (`audit`).
         steps: number of steps of Adam, with a learning rate that falls to 0.
-        rate: learning rate of the first step, in deviations of the guide; the weights of one location share it.
+        rate: learning rate of the first step, in standard deviations of the guide. Weights that affect the same
+            location divide it equally among them.
         draws: number of draws of every sequence in each step.
         reach: largest distance in steps of linear dependencies between local latents; None for no limit.
         seed: seed of the draws.
@@ -293,7 +295,14 @@ def missing_latents(model: DynamicalVAE) -> dict[str, tuple[Parent, ...]]:
 def _start(
     model: DynamicalVAE, data: Mapping[str, Any], missing: bool, reach: int | None
 ) -> tuple[DynamicalVAE, dict[str, Correction]]:
-    """Return the model with initial corrections, and these corrections."""
+    """Return a copy of the model with initial corrections of its guide, and these corrections by latent.
+
+    Args:
+        model: model with its guide.
+        data: sequences that the guide will be fitted to.
+        missing: whether the guide also reads the latents from `missing_latents`.
+        reach: largest distance in steps of links between local latents; None for no limit.
+    """
     added = missing_latents(model) if missing else {}
     draws = _GuideDraws(model, data)
     corrections = {}
@@ -357,7 +366,12 @@ class _GuideDraws:
         return Correction(unit, torch.zeros_like(unit), torch.zeros_like(unit), self.links(factor, reach))
 
     def links(self, factor: Factor, reach: int | None) -> tuple[Link, ...]:
-        """Return links to the latents among the parents, with zero weights."""
+        """Return links with zero weights from a latent to each latent among its parents.
+
+        Args:
+            factor: factor of the guide.
+            reach: largest distance in steps between the latent and a local parent; None for no limit.
+        """
         _, size, _, width = self.values[factor.child].shape
         length = max(value.shape[2] for value in self.values.values())
         links = []

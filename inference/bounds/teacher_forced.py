@@ -34,7 +34,24 @@ def bounds(
     estimates: int,
     parts: Iterable[slice],
 ) -> dict[str, Any]:
-    """Return bounds and KL terms in nats per sequence (N,), KL by step (T,), estimates (E, N) and frames (N,)."""
+    """Return the bounds of one model for N sequences.
+
+    Args:
+        name: name of the model, for errors.
+        model: model with its guide.
+        batch: batch of all sequences.
+        keys: (split, clip, first frame) of each sequence, for errors.
+        particles: K of the IWAE bound.
+        estimates: E, number of independent IWAE estimates of every sequence.
+        parts: slices of the sequences, evaluated one after another.
+
+    Returns:
+        "bounds": ELBO, IWAE bound, k-hat and KL of each latent by name, (N,) each, in nats per sequence. "kl_steps":
+        mean KL by step, (T,), of each local latent. "estimates": (E, N). "frames": numbers of valid frames (N,).
+
+    Raises:
+        FloatingPointError: when a bound is not finite.
+    """
     results: list[dict[str, Tensor]] = []
     steps: dict[str, Tensor] = {}
     for part in parts:
@@ -72,7 +89,7 @@ def filtered(
     particles: int,
     parts: Iterable[slice],
 ) -> dict[str, np.ndarray]:
-    """Return the FIVO bound in nats per sequence (N,)."""
+    """Return the FIVO bound by its name, in nats per sequence (N,); arguments and errors as in `bounds`."""
     values = []
     for part in parts:
         bound = fivo_bound(model, on_device_of(model, batch.rows(part)), particles).bound
@@ -82,7 +99,15 @@ def filtered(
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
-    """Return the variance over sequences of each latent's posterior mean, pooled over steps, (D,)."""
+    """Return the variance (D,) over sequences of each latent's posterior mean, by name of the latent.
+
+    Variances of local latents are pooled over steps. The noise of posterior means over a few draws is subtracted.
+
+    Args:
+        model: model with its guide.
+        batch: batch of all sequences.
+        parts: slices of the sequences, evaluated one after another.
+    """
     sums: dict[str, Tensor] = {}
     for part in parts:
         piece = on_device_of(model, batch.rows(part))
@@ -113,7 +138,16 @@ def _posterior_means(model: DynamicalVAE, batch: Batch) -> dict[str, Tensor]:
 
 
 def information(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:
-    """Return each latent's information about the data among the M sequences, (T,), or (1,) if static."""
+    """Return each latent's information about the data, by name of the latent; `compare` defines it.
+
+    Args:
+        model: model with its guide.
+        batch: batch of the M sequences that are contrasted with each other.
+        parts: slices of the sequences, evaluated one after another.
+
+    Returns:
+        Information in nats: by step (T,) for a local latent, (1,) for a static one; at most log M.
+    """
     batch = on_device_of(model, batch)
     size = length_of(batch)
     latents = model.guide(batch) if size else {}

@@ -73,8 +73,8 @@ class Bracket(Result):
     """Bounds of one model on the same sequences and on as many simulated ones, in nats per sequence.
 
     Attributes:
-        bounds: "real" and "simulated" to {bound: (N,)}; "upper" only for simulated data, FIVO if the model allows it,
-            semi-amortized bounds if the guide is normal.
+        bounds: dictionary from "real" and "simulated" to {name of the bound: values (N,)}. "upper" exists only for
+            simulated data, FIVO if the model allows it, and semi-amortized bounds if the guide is normal.
         keys: (split, clip, first frame) of every sequence.
         frames: number of frames of every sequence, real and simulated, (N,).
         equations: "generative" and "inference".
@@ -121,7 +121,7 @@ class Bracket(Result):
         """
         bounds = self.bounds[data]
         if missing := [name for name in (bound, above) if name and name not in bounds]:
-            raise KeyError(f"{data} data have no {missing[0]!r}; they have {', '.join(bounds)}")
+            raise KeyError(f"there is no bound {missing[0]!r} for {data} data; the bounds are {', '.join(bounds)}")
         values = bounds[bound] - (bounds[above] if above else 0.0)
         weights = self.frames if frame else np.ones(len(values))
         clips = clip_index(self.keys).numpy() if data == "real" else np.arange(len(values))
@@ -220,7 +220,7 @@ class Bracket(Result):
         if unknown := (real.keys() | simulated.keys()) - {*BOUNDS}:
             raise ValueError(f"unknown bounds {', '.join(sorted(unknown))}; expected some of {', '.join(BOUNDS)}")
         if self.extents != {"sequence": {len(self.keys)}} or not self.keys:
-            raise ValueError(f"expected {len(self.keys)} numbers of every bound")
+            raise ValueError(f"every bound must have one value for each of the {len(self.keys)} sequences in `keys`")
         if not all(np.isfinite(values).all() for values in (self.frames, *real.values(), *simulated.values())):
             raise ValueError("bounds and numbers of frames must be finite")
         if self.equations.keys() != {"generative", "inference"}:
@@ -266,8 +266,8 @@ def bracket(
     Args:
         model: model with its guide.
         data: windows, x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
-        count: number of sequences to draw at random; None for all.
-        particles: K, number of draws of ELBOs and IWAE, and of particles of FIVO.
+        count: number of randomly chosen sequences to evaluate; None for all.
+        particles: K, number of draws for the ELBOs and the IWAE bound, and number of particles of the FIVO bound.
         temperatures, chains: L and K of annealed importance sampling, as in `annealed_bound`.
         fitting: number of steps of the semi-amortized guides (`semi_amortized_guide`); 0 omits them and the parts of
             the gap, and chains start at the model's own guide.
@@ -404,9 +404,15 @@ class _Work:
     def bounds(
         self, data: Mapping[str, Any], latents: Mapping[str, Tensor] | None, seeds: Sequence[int], advance: Any
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the bounds (B,) by name, and effective chains (B,); with exact latents, also an upper bound.
+        """Return the bounds (B,) by name, and the effective number of chains (B,).
 
         The draws of all ELBOs have the same seed, so that their differences have less noise.
+
+        Args:
+            data: batch of B sequences.
+            latents: exact latents of simulated data, which also give an upper bound; None for real data.
+            seeds: seeds of evaluation, of fitting the semi-amortized guides, and of annealed importance sampling.
+            advance: function called after each part of the work, for the progress bar.
         """
         model, bounds = self.model, {}
         evaluation_seed, fitting_seed, annealing_seed = seeds

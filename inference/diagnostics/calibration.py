@@ -92,11 +92,12 @@ class Calibration(Result):
 
     @property
     def spread(self) -> np.ndarray:
-        """Standard deviation of the truth about the guide's mean, relative to the guide's, (Q,); above 1: too narrow.
+        """Standard deviation of the truth about the guide's mean, divided by the guide's, (Q,).
 
-        Bias and spread are the mean and deviation of the normal truth that makes these ranks among L standard normal
-        draws most likely. They are accurate if guide and posterior are normal. If ranks accumulate at an end, the data
-        do not determine them; a prior with less weight than one simulation keeps them finite.
+        Above 1, the guide is too narrow. Bias and spread are maximum likelihood estimates: the mean and standard
+        deviation of a normal truth, given its ranks among L standard normal draws. They are accurate if guide and
+        posterior are normal. If ranks accumulate at 0 or L, the likelihood has no finite maximum; a prior with less
+        weight than one simulation keeps the estimates finite.
         """
         return np.exp(self._normals[:, 1])
 
@@ -240,7 +241,7 @@ def calibrate(
         draws: L, number of draws from the guide for each simulation.
         guide: Pyro program of the batch, with a site (B, T, D) or (B, D) for every latent.
         steps: steps of local latents to rank, from 1; all by default.
-        context: context variables (C, T, D) or (C, D), used in turn.
+        context: context variables (C, T, D) or (C, D) by name; simulations use the C values in turn.
         seed: seed of simulations and draws.
         chunk: largest number of sequences times draws in memory.
         progress: whether to show a progress bar.
@@ -327,7 +328,15 @@ class _Points:
 
     @classmethod
     def of(cls, model: DynamicalVAE, context: Mapping[str, Tensor], count: int, length: int, steps: Tensor) -> Self:
-        """Return `count` new simulations."""
+        """Return points from new simulations.
+
+        Args:
+            model: model to simulate.
+            context: context variables (C, T, D) or (C, D) by name, empty if none.
+            count: M, number of simulations.
+            length: T of the simulated sequences.
+            steps: indices of the ranked steps of local latents.
+        """
         simulated = _simulate(model, context, count, length)
         return cls(_data(model, simulated), _coordinates(model, simulated, steps))
 
@@ -338,18 +347,18 @@ class _Points:
 
 
 def _scale(values: Tensor) -> Tensor:
-    """Return standard deviations of columns; 1 for constant columns."""
+    """Return the standard deviation of each column of values (N, Q); 1 for a constant column."""
     scale = values.std(0, correction=0)
     return torch.where(scale > 0, scale, 1.0)
 
 
 def _data(model: DynamicalVAE, batch: Mapping[str, Any]) -> Tensor:
-    """Return the data as (B, F)."""
+    """Return all data variables of a batch as flat vectors (B, F)."""
     return torch.cat([batch[name].flatten(1) for name in model.observed], 1)
 
 
 def _coordinates(model: DynamicalVAE, latents: Mapping[str, Tensor], steps: Tensor) -> Tensor:
-    """Return all latents at these steps as (B, Q)."""
+    """Return all latents, local ones at these steps only, as flat vectors (B, Q)."""
     local = model.generative.local
     return torch.cat(
         [(latents[name][:, steps] if local(name) else latents[name]).flatten(1) for name in model.latents], 1

@@ -38,7 +38,7 @@ class Statistic:
     """Statistic of a sequence.
 
     Args:
-        function: function from x (..., T, D) to (...). For windows with missing entries x is NaN there, as it is in
+        function: function from x (..., T, D) to (...). Missing entries of x are NaN, in real windows and in their
             replicates.
         unit: unit of the statistic.
         note: line printed below the table.
@@ -348,8 +348,8 @@ def predictive_checks(
         statistics: `Statistic` by name, for example from an application; `default_statistics` by default.
         samples: S, number of replicates of each window; at least 19, so that tail areas below .05 have a probability of
             at most a tenth.
-        draw_emission: whether replicates are draws of x. Otherwise they are its means, without emission noise, and the
-            check is of displayed forecasts rather than of the model.
+        draw_emission: whether replicates are draws of x. If False, they are its means, without emission noise; the
+            check then assesses displayed forecasts rather than the model.
         seed: seed of every model's draws.
         batch_size: number of windows in a batch.
         progress: whether to show a progress bar.
@@ -460,9 +460,13 @@ def _measure(
 def decode(
     model: DynamicalVAE, batch: Mapping[str, Tensor], latents: Mapping[str, Tensor], mean_emission: bool
 ) -> Tensor:
-    """Return x (B, T, D) of a free run given context and latents; other latents are drawn.
+    """Return x (B, T, D) of a free run given context and latents, in data space instead of the model's view.
 
-    x is in data space, not in the model's view. First frames that are context are kept.
+    Args:
+        model: model to run.
+        batch: batch with x, which determines B and T, and context. First frames of x that are context are kept.
+        latents: values of latents by name; all others are drawn from the model.
+        mean_emission: whether x are means of the emission instead of draws.
     """
     data = model.read(batch)
     context = {name: value for name, value in data.items() if name in model.context}

@@ -38,7 +38,12 @@ def split(flat: Tensor, like: Values) -> dict[str, Tensor]:
 
 
 def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
-    """Return names of the scalar entries of latents: "w[0]", "z_3[1]" (step from 1, coordinate from 0)."""
+    """Return names of the scalar entries of latents: "w[0]", "z_3[1]" (step from 1, coordinate from 0).
+
+    Args:
+        model: model with these latents.
+        steps: steps of the local latents, from 1.
+    """
     local = [f"_{t}" for t in steps]
     return tuple(
         f"{name}{step}[{d}]"
@@ -49,7 +54,7 @@ def quantities(model: DynamicalVAE, steps: Iterable[int]) -> tuple[str, ...]:
 
 
 def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | None) -> list[Batch]:
-    """Return batches of one sequence each, as the model reads them, if their posteriors have a score.
+    """Return batches of one sequence each, after checking that the log posterior has a gradient in the latents.
 
     Args:
         model: the model.
@@ -57,8 +62,8 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
         sequences: indices of sequences in the batch; None for all.
 
     Raises:
-        ValueError: when the model has no likelihood or latents, or a latent is shared by sequences or restricted to
-            some real numbers. Also when data are missing, or a sequence is not in the batch.
+        ValueError: when the model has no likelihood or latents, or a latent is shared by sequences or cannot take every
+            real value. Also when data are missing, or a sequence is not in the batch.
     """
     require_likelihood(model)
     require_latents(model)
@@ -66,8 +71,9 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
         conditional = model.generator[name]
         if conditional.support is not None or conditional.head.deterministic:
             raise ValueError(
-                f"under the distribution of {conditional.factor}, the latent {name} cannot be any real number, but "
-                "gradient-based sampling requires it; use a distribution such as distributions.Normal()"
+                f"the distribution of {conditional.factor} restricts the values of the latent {name}, but "
+                "gradient-based sampling requires latents on the whole real line; "
+                "use a distribution such as distributions.Normal()"
             )
     data = model.read(batch)
     if model.grouped and data.group is not None:

@@ -43,8 +43,8 @@ class Descent:
         steps: number of steps of Adam.
         rate: initial learning rate; it falls to 0 along a cosine.
         starts: S, number of starts for each sequence; the lowest result is kept.
-        candidates: number of draws from the prior, and from the guide if there is one. These draws and the mean of the
-            prior's are divided among the starts; each start is the most probable of its share.
+        candidates: number of draws from the prior, and from the guide if there is one. These draws, and the mean of the
+            draws from the prior, are divided among the starts. Each start is the most probable candidate of its part.
         renewed: number of steps between calls of `renew`.
         newton: number of Newton steps at the end, each with its own curvature.
 
@@ -284,7 +284,7 @@ class _Search:
         return torch.stack([candidates[n::starts][energies[n::starts].argmin(0), each] for n in range(starts)])
 
     def _draw(self, program: _Program) -> dict[str, Tensor]:
-        """Return the latents that a program draws."""
+        """Return the latents of the searched program that another program, such as a guide, draws, by name."""
         nodes: dict[str, Any] = poutine.trace(program).get_trace(self.batch).nodes
         return {name: nodes[name]["value"] for name in self.latents if name in nodes}
 
@@ -319,7 +319,13 @@ class _Search:
             return self._energy(self._renew(batch, values), values)
 
     def _curvature(self, batch: Any, values: Tensor, sites: Collection[str] | None = None) -> tuple[Tensor, Tensor]:
-        """Return gradients (B, P) and second derivatives (B, P, P) of the energy, or of the part of these sites."""
+        """Return gradients (B, P) and second derivatives (B, P, P) of the energy with respect to the latents.
+
+        Args:
+            batch: batch of the program.
+            values: latents as flat vectors (B, P).
+            sites: names of the sites whose energy is used, such as the latents for the prior; None for all.
+        """
         values = values.clone().requires_grad_()
         with torch.enable_grad():
             energy = self._energy(batch, values, sites)
@@ -331,7 +337,13 @@ class _Search:
         return gradient.detach(), torch.stack(columns, -1)
 
     def _line_search(self, batch: Any, values: Tensor, step: Tensor) -> Tensor:
-        """Return the best of a full, half, quarter or eighth step, or no step if none lowers the energy."""
+        """Return latents (B, P) after the best of a full, half, quarter or eighth step; unchanged if none is better.
+
+        Args:
+            batch: batch of the program.
+            values: latents as flat vectors (B, P).
+            step: Newton step (B, P).
+        """
         shares = step.new_tensor([1.0, 0.5, 0.25, 0.125, 0.0])
         candidates = [values + share * step for share in shares]
         energies = torch.stack([self._measure(batch, each) for each in candidates]).nan_to_num(torch.inf)
@@ -354,7 +366,7 @@ def _energy(program: _Program, batch: Any, values: Values, sites: Collection[str
 
 
 def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lower roots (B, P, P) of the inverse curvature, and the number of directions in which it was raised.
+    """Return lower triangular roots (B, P, P) of the inverse curvature, and the number of raised directions.
 
     Where the curvature is less than the prior's, it is raised to the prior's.
     """

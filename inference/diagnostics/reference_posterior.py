@@ -371,7 +371,7 @@ def reference_posterior(
     """Compare a guide with the posterior of the latents of some sequences.
 
     The posterior of a linear-Gaussian model is exact. For any other model it is sampled by NUTS, which is slow: see
-    docs/criticism.md for the cost. The result reports whether sampling has converged.
+    docs/how-to/calibrate.md for the cost. The result reports whether sampling has converged.
 
     Args:
         model: generative model; its own guide is tested by default.
@@ -384,8 +384,8 @@ def reference_posterior(
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or restricted to
-            some real numbers. Also when a sequence is not in the batch, data are missing, or a number is too small.
+        ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or cannot take every
+            real value. Also when a sequence is not in the batch, data are missing, or a number is too small.
         FloatingPointError: when the log joint is not finite at the start of a chain.
 
     Example:
@@ -397,8 +397,8 @@ def reference_posterior(
     """
     if min(draws, guide_draws) < 4 or chains < 2 or warmup < 1:  # arviz needs as many for R-hat
         raise ValueError(
-            f"NUTS needs at least 4 draws, 2 chains and 1 of warm-up, and the guide 4 draws; got {draws}, {chains}, "
-            f"{warmup} and {guide_draws}"
+            f"draws and guide_draws must be at least 4, chains at least 2 and warmup at least 1; got draws={draws}, "
+            f"guide_draws={guide_draws}, chains={chains} and warmup={warmup}"
         )
     with seeded_evaluation(model, seed), progress_bar(progress) as bar:
         batches = some_of(model, batch, sequences)

@@ -7,7 +7,8 @@
 is inverse multiquadric, k(u, v) = (1 + |u - v|^2 / b^2)^(-1/2). Its tails are heavy enough to detect draws that do not
 converge to the posterior (Gorham and Mackey, 2017, arXiv 1703.01717). The latents u are preconditioned: each number is
 in standard deviations of the guide, estimated from separate draws. The bandwidth is b^2 = 2 P, the mean squared
-distance between two draws of P such numbers. The score needs no evidence; it is one gradient of the model.
+distance between two draws of P such numbers. The score does not depend on the evidence, and costs one gradient of the
+model.
 
 p-values use the wild bootstrap: the mean of h with random signs of the draws has the distribution of KSD^2 for draws
 from the posterior. The joint test compares sums over sequences, and has more power than tests of single sequences.
@@ -45,7 +46,7 @@ class SteinDiscrepancy(Result):
     Attributes:
         squared: KSD^2, (S,); unbiased, so it may be negative.
         critical: value that draws from the posterior exceed in 5 % of cases, (S,).
-        p_values: share of the bootstrap that is not below the value, (S,).
+        p_values: share of bootstrap values, with `squared` itself among them, that are at least `squared`, (S,).
         p_value: p-value of all sequences together, by the sum of their KSD^2.
         numbers: P, number of latent values of each sequence, (S,).
         sequences: indices of the sequences in the batch.
@@ -133,8 +134,8 @@ def stein_discrepancy(
     """Test for each sequence whether a guide's draws are from the posterior, on data of any kind.
 
     The test uses the gradient of the log joint at the guide's draws, and no draws from the posterior. A small p-value
-    shows that the guide is wrong. A large one is weak evidence if there are many latent values: see docs/criticism.md
-    for the power of the test.
+    shows that the guide is wrong. A large one is weak evidence if there are many latent values: see
+    benchmarks/results/criticism for the power of the test.
 
     Args:
         model: generative model; its own guide is tested by default.
@@ -147,8 +148,8 @@ def stein_discrepancy(
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or restricted to
-            some real numbers. Also when a sequence is not in the batch, data are missing, or a number is too small.
+        ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or cannot take every
+            real value. Also when a sequence is not in the batch, data are missing, or a number is too small.
         FloatingPointError: when a gradient is not finite.
 
     Example:

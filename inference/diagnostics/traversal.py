@@ -21,7 +21,7 @@ class Traversal:
 
     Attributes:
         latent: name of the latent.
-        coordinates: the C shifted coordinates, one at a time.
+        coordinates: indices of the C coordinates, which are shifted one at a time.
         offsets: offsets (M,) in units of `scale`; 0 is the inferred latent.
         scale: standard deviation of each coordinate under the prior or the posterior, (C,).
         frames: decoded x, (C, M, B, T, D).
@@ -37,7 +37,7 @@ class Traversal:
 
     @property
     def effect(self) -> Tensor:
-        """Root mean square change of x about its mean over offsets, over sequences, steps and dimensions, (C,)."""
+        """Standard deviation of x over offsets, as a root mean square over sequences, steps and dimensions, (C,)."""
         return self.frames.var(1, correction=0).mean((1, 2, 3)).sqrt()
 
 
@@ -83,14 +83,14 @@ def traverse(
     """
     if latent not in model.latents or not set(free) <= set(model.latents) - {latent}:
         raise ValueError(
-            f"the latents are {', '.join(model.latents)}; expected one of them to shift and others in `free`, got "
-            f"{latent} and free={tuple(free)}"
+            f"`latent` must be one of {', '.join(model.latents)}, and `free` must list others of these; got "
+            f"latent={latent!r} and free={tuple(free)}"
         )
     indices = tuple(range(model.sizes[latent]) if coordinates is None else coordinates)
     if not indices or not set(indices) <= set(range(model.sizes[latent])) or steps < 2 or draws < 2:
         raise ValueError(
             f"coordinates of {latent} must be from 0 to {model.sizes[latent] - 1}, steps and draws at least 2; "
-            f"got {indices}, {steps} and {draws}"
+            f"got coordinates={indices}, steps={steps} and draws={draws}"
         )
     offsets = torch.linspace(*span, steps, dtype=torch.float64)
     offsets[offsets.abs() < 1e-9 * offsets.abs().max()] = 0
@@ -139,7 +139,16 @@ def _check_path(model: DynamicalVAE, latent: str, free: Sequence[str]) -> None:
 
 
 def _scale(model: DynamicalVAE, data: dict[str, Tensor], latent: str, unit: str, draws: int) -> Tensor:
-    """Return standard deviations (D,) of a latent's coordinates, pooled over steps (and sequences, if posterior)."""
+    """Return standard deviations (D,) of a latent's coordinates over draws.
+
+    Args:
+        model: model with its guide.
+        data: batch as returned by `read`.
+        latent: name of the latent.
+        unit: "prior" for draws from the model, pooled over steps; "posterior" for draws from the guide given each
+            sequence, whose variances are averaged over sequences and steps.
+        draws: number of draws.
+    """
     if unit == "prior":
         size, length = data["x"].shape[:2]
         rows = torch.arange(draws) % size

@@ -225,7 +225,7 @@ def _score_model(
 
 
 def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> ModelResult:
-    """Return a row from the scores of the models of all seeds; `model` is one of these models."""
+    """Return one model's row of the comparison from the scores of all its seeds; `model` is the model of any seed."""
     excluded = {"frames", "notes"}
     scores = _stack([{key: value for key, value in seed.items() if key not in excluded} for seed in seeds])
     equations = {"generative": model.generative.text, "inference": model.inference.text}
@@ -235,7 +235,7 @@ def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: 
 
 
 def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
-    """Return the models of every seed by name."""
+    """Return a dictionary from row name to the models of all its seeds."""
     if not isinstance(models, Mapping):
         raise TypeError(f"models must be a mapping such as {{'srnn': model}}, not {type(models).__name__}")
     for name, value in models.items():
@@ -248,7 +248,10 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
     }
     if not contenders or not all(contenders.values()):
         empty = next((name for name, versions in contenders.items() if not versions), None)
-        raise ValueError("expected models to compare: " + (f"{empty!r} has no model" if contenders else "no models"))
+        raise ValueError(
+            "expected at least one model in every row of models, got "
+            + (f"none in {empty!r}" if contenders else "no rows")
+        )
     for name, versions in contenders.items():
         for version in versions:
             if not isinstance(version, DynamicalVAE):
@@ -266,7 +269,7 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
 
 
 def _each(contenders: Mapping[str, list[Any]]) -> Iterator[tuple[str, str, Any]]:
-    """Yield label, name and model of every seed."""
+    """Yield, for each seed, its label in messages, the name of its row, and the model."""
     for name, versions in contenders.items():
         for index, model in enumerate(versions):
             yield (name if len(versions) == 1 else f"{name}, model {index + 1}"), name, model
@@ -282,7 +285,7 @@ def _fingerprint(batch: Batch) -> str:
 
 
 def _stack(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the seeds' arrays, stacked by name."""
+    """Stack the arrays of all seeds along a new first axis, for each name."""
     columns = {key: [seed[key] for seed in seeds] for key in seeds[0]}
     return {
         key: _stack(values) if isinstance(values[0], Mapping) else np.stack(values) for key, values in columns.items()

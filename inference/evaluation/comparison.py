@@ -53,7 +53,7 @@ class ModelResult:
         variances: variance over the data of each coordinate's posterior mean, (S, D), of each latent.
         information: information of each latent, (S, T) in nats per step, or (S, 1) in nats per sequence if static.
         estimates: independent IWAE bounds in nats per sequence, (E, N), each the mean over seeds.
-        free_running: means of each clip's windows, (S, C), of each metric.
+        free_running: mean of each metric over the windows of each clip, (S, C).
         notes: requested scores that are not available, with reasons.
     """
 
@@ -149,7 +149,11 @@ class Comparison(Result):
         return sorted(self.rows, key=lambda name: -self[name]["IWAE bound"].mean)
 
     def difference(self, first: str, second: str, metric: str = "IWAE bound") -> Estimate:
-        """Return the paired difference of two models, first minus second; `estimates` describes its errors.
+        """Return the mean paired difference of two models, first minus second; module `estimates` describes its errors.
+
+        Args:
+            first, second: names of the models.
+            metric: name of the score, such as "IWAE bound" (nats per frame).
 
         Raises:
             KeyError: when a model was not compared, or one of the two has no such metric.
@@ -201,7 +205,7 @@ class Comparison(Result):
         return {name: self._parts(name, metric) for name in self.rows}
 
     def join(self, other: Comparison) -> Comparison:
-        """Return this comparison with the rows of another one, with the same sequences and settings.
+        """Return a comparison with the rows of this and another comparison of the same sequences and settings.
 
         Raises:
             ValueError: when sequences or settings differ, or both have a model of the same name.
@@ -306,12 +310,12 @@ class Comparison(Result):
 
         The results of `loo` have another meaning here. The sequences are held out already, so its elpd is the held-out
         log evidence. Its p ("effective parameters") measures how much the independent estimates differ, in nats; it is
-        Monte Carlo error. As elpd is a harmonic mean over draws, it is below their mean by about as much. More
-        particles lower both.
+        Monte Carlo error. The elpd is based on a harmonic mean over draws, so it is p nats below the log of their mean.
+        More particles reduce p.
 
-        Its k-hat is of the harmonic mean's weights. It warns if estimates of a sequence differ by a nat or more, and
-        nearly always with fewer than 200 draws. Its standard errors assume independent sequences and ignore seeds; the
-        standard errors of `difference` are clustered by clip.
+        Its k-hat describes the weights of the harmonic mean. It warns if estimates of a sequence differ by a nat or
+        more, and nearly always with fewer than 200 draws. Its standard errors assume independent sequences and ignore
+        seeds; the standard errors of `difference` are clustered by clip.
 
         Raises:
             ValueError: when there are fewer than 25 estimates, too few for `loo` to smooth.
@@ -367,7 +371,7 @@ class Comparison(Result):
     @override
     def check(self) -> None:
         if self.extents["sequence"] != {len(self.keys)}:
-            raise ValueError(f"expected values of {len(self.keys)} sequences, got {self.extents['sequence']}")
+            raise ValueError(f"`keys` lists {len(self.keys)} sequences, but arrays have {self.extents['sequence']}")
         for name, row in self.rows.items():
             if not {"ELBO", "IWAE bound", "k-hat"} <= row.bounds.keys():
                 raise ValueError(

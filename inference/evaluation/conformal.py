@@ -53,8 +53,8 @@ class PredictionBands(Result):
 
     Attributes:
         level: share of windows whose future the bands contain.
-        factors: half the width of the band over the spread, by region: "number" (H, D), "step" (H, 1) or "future" (1,
-            1).
+        factors: half the width of the band, divided by the spread, by region: "number" (H, D), "step" (H, 1) or
+            "future" (1, 1).
         spread: spread (H, D), in the unit of the data; None for the standard deviation of a window's forecasts.
         samples: K, number of forecasts of a window.
         seed: seed of their draws.
@@ -96,7 +96,8 @@ class PredictionBands(Result):
         """
         if region not in REGIONS:
             raise ValueError(
-                f"no prediction bands of a {region!r}{nearest(region, REGIONS)}; the regions are {', '.join(REGIONS)}"
+                f"no prediction bands for the region {region!r}{nearest(region, REGIONS)}; "
+                f"the regions are {', '.join(REGIONS)}"
             )
         shape = self.factors["number"].shape
         if forecasts.ndim != 4 or forecasts.shape[2:] != shape or len(forecasts) != self.samples:
@@ -169,7 +170,7 @@ class PredictionBands(Result):
             progress: whether to show a progress bar.
 
         Returns:
-            `scores` of these forecasts: "said" before, "held" after recalibration.
+            `scores` of these forecasts. Names with "said" are before recalibration, names with "held" after it.
         """
         models, references = ({}, [model]) if isinstance(model, str) else (model, [])
         return evaluate(
@@ -261,10 +262,10 @@ def conformal_bands(
         windows: calibration windows.
         level: share of windows to contain, between 0 and 1.
         groups: name of the exchangeable group of each window, if groups are larger than clips, such as its style. A
-            level of 0.9 needs 9 of them.
-        residuals: windows, such as training windows, for errors of the mean forecast. Their root mean square at each
-            frame and coordinate is the spread instead of the forecasts' standard deviation: for point forecasts, or a
-            badly distributed spread.
+            level of 0.9 needs at least 9 groups.
+        residuals: windows, such as training windows, on which the errors of the mean forecast are computed. The root
+            mean square of these errors, for each frame and coordinate, replaces the standard deviation of the forecasts
+            as spread. Use it for point forecasts, or if the standard deviation is a bad measure of the errors.
         samples: K, number of drawn forecasts of a window.
         training_windows: training data of "climatology" and "nearest neighbours".
         seed: seed of the draws.
@@ -333,8 +334,8 @@ def conformal_bands(
     factors = {region: quantile(largest_by_region(far, region), places, level) for region in REGIONS}
     if not all(factor.isfinite().all() for factor in factors.values()):
         raise ValueError(
-            "these prediction bands would be infinite: either forecasts have no spread, as point forecasts (pass "
-            f"`residuals`, windows to estimate a spread), or a value was observed in too few {clip}s"
+            "these prediction bands would be infinite. Either forecasts have no spread, such as point forecasts: pass "
+            f"`residuals`, windows to estimate a spread. Or a value was observed in too few {clip}s: use more windows"
         )
     return PredictionBands(
         level=level,
@@ -349,7 +350,9 @@ def conformal_bands(
 
 
 def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
-    """Return values by clip whose mean, weighted by windows, is the plain mean over clips, with the same errors.
+    """Return values by clip whose mean, weighted by numbers of windows, is the plain mean over clips.
+
+    The standard error is also that of the plain mean.
 
     Args:
         values: score of every window, `(N,)`.

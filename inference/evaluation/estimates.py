@@ -35,7 +35,14 @@ _ERRORS = ("sequences", "seeds", "total")
 
 
 def linearised(clip_means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted mean of clip means (..., C), a ratio of sums, and each clip's contribution to the error."""
+    """Return the weighted mean (...,) of clip means, and each clip's contribution (..., C) to its error.
+
+    The mean is a ratio of sums over clips, and its error is linearised.
+
+    Args:
+        clip_means: means (..., C) of C clips.
+        weights: weight (C,) of each clip, such as its number of windows.
+    """
     shares = weights / weights.sum()
     mean = (shares * clip_means).sum(-1)
     return mean, shares * (clip_means - mean[..., None])
@@ -48,7 +55,7 @@ def clustered_variance(deviations: np.ndarray) -> float:
 
 
 def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) -> int:
-    """Return the number of independent draws with the same uncertainty of histograms as draws dependent within clips.
+    """Return how many independent draws would give a histogram as uncertain as these draws, which depend within clips.
 
     The number is one over the root mean square of v / (p (1 - p)) over shares p, with v the clustered variance of the
     observed share. For N independent draws this ratio is 1 / N. With the mean instead of the root mean square, this is
@@ -102,7 +109,7 @@ class Estimate:
         sequences: standard error over sequences, clustered by clip.
         seeds: standard error over training seeds.
         total: standard error from both.
-        freedom: degrees of freedom of each of the three, in this order.
+        freedom: degrees of freedom of `sequences`, `seeds` and `total`, in this order.
     """
 
     mean: float
@@ -114,6 +121,10 @@ class Estimate:
     def interval(self, level: float = 0.95, error: str = "total") -> tuple[float, float]:
         """Return the confidence interval of the mean by Student's t, from one of the errors; NaN if it is unknown.
 
+        Args:
+            level: probability of the interval.
+            error: name of the error: "sequences", "seeds" or "total".
+
         Raises:
             ValueError: when the level is not between 0 and 1, or `error` is not one of the three.
         """
@@ -121,6 +132,9 @@ class Estimate:
 
     def p_value(self, error: str = "total") -> float:
         """Return the two-sided p-value of a zero mean by Student's t, from one of the errors; NaN if it is unknown.
+
+        Args:
+            error: name of the error: "sequences", "seeds" or "total".
 
         Raises:
             ValueError: when `error` is not one of the three.
@@ -147,7 +161,7 @@ def number(value: float, places: int = 3) -> str:
 
 
 def _freedom(total: float, *parts: tuple[float, float]) -> float:
-    """Return Satterthwaite's degrees of freedom of a sum of variances, each with its own; NaN if one is unknown."""
+    """Return Satterthwaite's degrees of freedom of a sum of (variance, freedom) pairs; NaN if one is unknown."""
     uncertainty = sum(part**2 / freedom if freedom else math.nan for part, freedom in parts)
     least = min(freedom for _, freedom in parts)  # the total is at most the sum of the parts
     return max(total**2 / uncertainty, least) if uncertainty else math.nan
@@ -187,7 +201,7 @@ class TwoWayErrors:
         return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / totals, totals)
 
     def estimate(self, other: TwoWayErrors | None = None) -> Estimate:
-        """Return the mean, or its paired difference to another model's, with errors as in the module docstring."""
+        """Return the mean, or its paired difference to another model's mean; errors as in the module docstring."""
         mean, deviations, between, rest = self.mean, self.deviations, self.seeds, self.rest
         of_seeds = [(self.seeds, self.count - 1)]
         if other is not None:

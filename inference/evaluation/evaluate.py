@@ -225,7 +225,14 @@ class _Evaluator:
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return the scores and histograms of free-running forecasts that `samples` suffices for."""
+        """Return free-running scores (C,) and histograms (C, bins) by name, for each of C clips.
+
+        Args:
+            name: name of the method, for errors.
+            forecaster: function from a slice of windows to futures (K, B, H, D).
+            samples: K, number of forecasts per window; scores that need more are omitted.
+            parts: slices of the windows, evaluated one after another.
+        """
         measures = [measure for measure in self.measures if measure.least <= samples]
         eval_windows, results = self.eval_windows, []
         index = torch.arange(len(eval_windows.keys))
@@ -243,7 +250,7 @@ class _Evaluator:
         return scores, histograms
 
     def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
-        """Return bounds and KL terms in nats per frame."""
+        """Return bounds, KL terms and k-hat by name, in nats per frame, for each clip."""
         results = []
         for part in parts:
             batch = on_device_of(model, self.eval_windows.part(part))
@@ -258,7 +265,7 @@ class _Evaluator:
         return self._means(_concatenate(results))
 
     def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
-        """Return the log score in nats per predicted frame, if it was requested."""
+        """Return the log score by its name, in nats per predicted frame, for each clip; empty if not requested."""
         if not self.log_score_particles:
             return {}
         results = []
@@ -300,13 +307,27 @@ def _references(
 
 
 def forecaster_of(model: Any, held: EvaluationWindows, samples: int, options: Mapping[str, Any]) -> Forecaster:
-    """Return the function from a slice of windows to a model's K futures, with `options` for its `forecast`."""
+    """Return a function that forecasts futures (K, B, H, D) of a slice of windows.
+
+    Args:
+        model: model that forecasts.
+        held: windows to forecast.
+        samples: K, number of futures per window.
+        options: further arguments of the model's `forecast`.
+    """
     horizon = held.futures.shape[1]
     return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
 
 
 def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: EvaluationWindows, part: slice) -> Tensor:
     """Return futures `(B, K, H, D)` of some windows, on the CPU.
+
+    Args:
+        name: name of the method, for errors.
+        forecaster: function from a slice of windows to futures (K, B, H, D).
+        samples: K, number of futures per window.
+        held: all windows.
+        part: slice of the windows to forecast.
 
     Raises:
         ValueError: when forecasts have another shape.

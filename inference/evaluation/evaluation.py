@@ -119,7 +119,11 @@ class Evaluation(Result):
         return {name: self._score(name, means) for name, means in self._row(method).clip_means.items()}
 
     def difference(self, first: str, second: str, metric: str) -> Score:
-        """Return the paired difference of two methods in a metric, first minus second, with its standard error.
+        """Return the mean paired difference of two methods in a metric, first minus second, with its standard error.
+
+        Args:
+            first, second: names of the methods.
+            metric: name of the score, such as "CRPS".
 
         Raises:
             KeyError: when a method was not evaluated, or one of the two has no such metric.
@@ -128,7 +132,11 @@ class Evaluation(Result):
         return self._score(metric, values - other)
 
     def ratio(self, first: str, second: str, metric: str) -> Score:
-        """Return the ratio of two methods' means in a metric, first by second, with its linearised standard error.
+        """Return the ratio of two methods' means in a metric, first divided by second, with its linearised error.
+
+        Args:
+            first, second: names of the methods.
+            metric: name of the score, such as "APD".
 
         Raises:
             KeyError: as `difference`.
@@ -198,10 +206,15 @@ class Evaluation(Result):
     def departure(self, method: str, histogram: str = "PIT", alpha: float = 0.05) -> tuple[np.ndarray, ...]:
         """Return the difference between a method's PIT distribution and uniform, with a simultaneous band.
 
-        The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Their number is the
-        effective number of these dependent ranks, from their spread over clips (`estimates.effective_number`). This is
-        an approximation, except for clips of one number each. A curve that leaves the band at any point indicates that
-        forecasts are not calibrated.
+        The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Ranks of one clip depend
+        on each other, so the envelope is for their effective number, estimated from their spread over clips
+        (`estimates.effective_number`). It is an approximation, unless each clip contributes a single number. A curve
+        that leaves the band at any point indicates that forecasts are not calibrated.
+
+        Args:
+            method: name of the method.
+            histogram: name of its histogram.
+            alpha: probability that the curve of calibrated forecasts leaves the band.
 
         Returns:
             Points between bins, the share of the PIT below each minus the point itself, and the lower and upper end of
@@ -258,7 +271,7 @@ class Evaluation(Result):
         Bands are two standard errors, clustered by clip. The scores come from `scores.over_horizon`.
 
         Raises:
-            KeyError: when no method has a histogram of a frame.
+            KeyError: when no method has a histogram of a single frame.
         """
         _, frame = axis_names(self.data)
 
@@ -270,7 +283,7 @@ class Evaluation(Result):
         by_method = {method: by_frame("PIT", row.histograms) for method, row in self.rows.items()}
         by_method = {method: histograms for method, histograms in by_method.items() if histograms}
         if not by_method:
-            raise KeyError("no method has a histogram of a frame; evaluate with scores=over_horizon")
+            raise KeyError("this evaluation has no PIT histograms of single frames; evaluate with scores=over_horizon")
         columns = max(map(len, by_method.values())) + 1
         figure = new_figure(1 + 1.5 * columns, 0.9 + 1.7 * len(by_method))
         panels = figure.subplots(len(by_method), columns, squeeze=False)
@@ -324,7 +337,7 @@ class Evaluation(Result):
     @override
     def check(self) -> None:
         if self.extents.get("clip", {len(self.clips)}) != {len(self.clips)}:
-            raise ValueError(f"expected values of {len(self.clips)} clips, got {self.extents['clip']}")
+            raise ValueError(f"`clips` lists {len(self.clips)} clips, but arrays have {self.extents['clip']}")
         if unknown := {name for row in self.rows.values() for name in row.clip_means} - self.metrics.keys():
             raise ValueError(f"metrics has no entry for {', '.join(sorted(unknown))}")
 

@@ -109,8 +109,8 @@ def prepare_windows(data: Any) -> EvaluationWindows:
         )
     if not 1 <= observed < batch["x"].shape[1]:
         raise ValueError(
-            f"windows must have a step to observe and a step to predict, but of {batch['x'].shape[1]} steps "
-            f"{observed} are observed"
+            f"windows must have at least 1 observed step and 1 step to predict, but {observed} of "
+            f"{batch['x'].shape[1]} steps are observed"
         )
     eval_windows = EvaluationWindows(windows, batch, observed, list(windows.keys))
     if eval_windows.mask is not None:
@@ -132,7 +132,7 @@ def clip_index(keys: Sequence[tuple[str, str, int]]) -> Tensor:
 
 @contextmanager
 def seeded_evaluation(model: nn.Module, seed: int) -> Iterator[None]:
-    """Use evaluation mode, no gradients and draws from `seed`, and restore mode and random state afterwards."""
+    """Set evaluation mode, disable gradients and seed the draws; restore mode and random state on exit."""
     with seeded(seed, next(model.parameters()).device), evaluating(model), torch.no_grad():
         yield
 
@@ -149,7 +149,17 @@ def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
 
 
 def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
-    """Raise FloatingPointError for the first window whose entry in `finite` (B,) is False."""
+    """Raise an error if a result is not finite, which names the first such window.
+
+    Args:
+        name: name of the method.
+        what: name of the result, such as "bound".
+        finite: (B,), whether the result of each window is finite.
+        keys: (split, clip, first frame) of each window.
+
+    Raises:
+        FloatingPointError: when an entry of `finite` is False.
+    """
     if not finite.all():
         split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
         raise FloatingPointError(

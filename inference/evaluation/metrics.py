@@ -139,9 +139,9 @@ def pit_mean(samples: Array, truth: Array) -> Tensor:
 def pit_variance(samples: Array, truth: Array) -> Tensor:
     """Return the mean square of PIT - 1/2, in twelfths: 1 for calibrated forecasts, more for too narrow ones.
 
-    It is about 1/2 rather than its own mean, so it is also above 1 for forecasts that are too high or too low. With K =
-    1 it is 1 for any forecast. Its largest value, if the truth is always outside all samples, is 3 - 6 / (K + 1) + 4 /
-    (K + 1)^2. Shapes as in `pit_mean`.
+    Deviations are from 1/2 rather than from the mean PIT, so the value is also above 1 for forecasts that are too high
+    or too low. With K = 1 it is 1 for any forecast. Its largest value, if the truth is always outside all samples, is 3
+    - 6 / (K + 1) + 4 / (K + 1)^2. Shapes as in `pit_mean`.
     """
     samples, truth = as_pair(samples, truth)
     low, ties = _ranks(samples, truth)
@@ -175,9 +175,9 @@ def tarp_histogram(samples: Array, truth: Array, reference: Array, bins: int = 2
 
     The statistic is the share of samples in the ball around the point with the truth on its surface. It is uniform if
     samples and truth have the same distribution, for any point, any K and with ties, as in `pit_histogram`. Unlike the
-    PIT of single numbers, it depends on all numbers together. If it is uniform for all points that depend on the input
-    of the forecast, samples and truth have the same distribution. With points that do not depend on the input, samples
-    that ignore the input also pass.
+    PIT of single numbers, it depends on all numbers together. If it is uniform for every choice of a point that depends
+    on the forecast's input, samples and truth have the same distribution. With points that do not depend on the input,
+    samples that ignore the input also pass.
 
     Args:
         samples: samples `(..., K, T, D)`.
@@ -205,13 +205,13 @@ def coverage(samples: Array, truth: Array, level: float) -> Tensor:
     is whole, the interval is from the h-th smallest sample to the h-th largest one. These contain a truth that is
     exchangeable with them with probability 1 - 2 h / (K + 1), exactly.
 
-    Otherwise, each end is in a gap between two samples. A truth in this gap counts as the part of the gap, by its rank,
-    that is inside. This equals an interval whose ends are drawn from the two samples so that their mean ranks are h. A
-    truth with ties counts as the part of its ranks that is inside, so coverage is `level` for discrete data, too.
-    (Intervals with all their ties contain more.)
+    Otherwise, each end is in a gap between two samples. A truth in this gap counts as the share of the gap, measured in
+    ranks, that is inside the interval. This equals an interval whose ends are drawn from the two samples so that their
+    mean ranks are h. A truth that equals some samples counts as the share of its possible ranks that is inside, so
+    coverage is `level` for discrete data, too. (Intervals with all their ties contain more.)
 
-    Below h = 1, for K < 2 / (1 - level) - 1, the interval extends beyond all samples with probability 1 - h. Its mean
-    is still `level` for calibrated forecasts, but it is less informative about others, and with K = 1 not at all.
+    Below h = 1, for K < 2 / (1 - level) - 1, the interval extends beyond all samples with probability 1 - h. The mean
+    coverage is still `level` for calibrated forecasts. It reveals less about other forecasts, and nothing with K = 1.
 
     Args:
         samples: samples `(..., K, T, D)`.
@@ -391,7 +391,7 @@ def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> t
 def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """Return means (1 + C, F) and covariances (1 + C, F, F) of features (N, K, F).
 
-    The first are of all windows; each of the others omits the windows of one of C > 1 clips.
+    Entry 0 is for all windows. Each other entry omits the windows of one of C > 1 clips.
     """
 
     def sums(values: Tensor) -> Tensor:
@@ -425,7 +425,7 @@ def _ranks_outside(samples: Tensor, level: float) -> float:
 
 
 def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a score of distances that ignores missing values of a truth (T, D).
+    """Wrap a score of distances so that it ignores missing values of a truth (T, D).
 
     It uses frames with observations, and sets missing numbers of samples and truth to 0.
     """

@@ -3,16 +3,17 @@
 With many pairs, some 95 % intervals exclude 0 by chance alone. `pairs` has p-values adjusted by Holm's step-down
 procedure (1979), which are valid for all pairs at once under any dependence. `confidence_set` is the model confidence
 set (Hansen, Lunde and Nason, 2011): models that are not significantly worse than one another. It repeatedly drops the
-model that is most clearly worse, and contains the best model with at least its level. The less informative the data,
-the more models it contains. `required` computes the power of a paired difference for other numbers of seeds and clips.
+model that is most clearly worse, and contains the best model with a probability of at least its level. The less
+informative the data, the more models it contains. `required` computes the power of a paired difference for other
+numbers of seeds and clips.
 
 Errors are computed as in `estimates`: over clips, which models share, and over training seeds, which they do not.
-Variances over few seeds are uncertain, and if they are small by chance, differences look significant that are not. The
-null distribution of the confidence set therefore draws variances first: each is the measured one times f divided by a
-chi-squared draw with its f degrees of freedom. For a single difference this is Student's t (the fiducial distribution
-of Behrens and Fisher). The paper's block bootstrap is not possible with two or three seeds. Each pair has its own null
-distribution, and the smallest of these p-values is compared with its null distribution (Westfall and Young, 1993); the
-paper uses the largest t of all pairs.
+Variances over few seeds are uncertain. A variance that is small by chance makes a difference look significant when it
+is not. The null distribution of the confidence set therefore draws variances first: each is the measured one times f
+divided by a chi-squared draw with its f degrees of freedom. For a single difference this is Student's t (the fiducial
+distribution of Behrens and Fisher). The paper's block bootstrap is not possible with two or three seeds. Each pair has
+its own null distribution, and the smallest of these p-values is compared with its null distribution (Westfall and
+Young, 1993); the paper uses the largest t of all pairs.
 """
 
 from __future__ import annotations
@@ -289,8 +290,8 @@ def required(
     sought = abs(measured.mean if difference is None else difference)
     if math.isnan(measured.total) or not 0 < sought < math.inf:
         raise ValueError(
-            "both models need at least two seeds and two clusters, and a finite difference that is not 0; got "
-            f"{sought}, with a standard error of {measured.total}"
+            "both models need at least two seeds and two clusters, and a finite, nonzero difference to detect; "
+            f"got a difference of {sought} with a standard error of {measured.total}"
         )
     rows = (first, second)
     rest = [row.rest * row.count * count for row in rows]  # variances of single seeds and clips

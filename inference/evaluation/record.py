@@ -31,7 +31,7 @@ _Path = tuple[str, ...]
 
 @dataclass(frozen=True, init=False)
 class Dims:
-    """Mark of an array, or of a mapping to arrays.
+    """Annotation that names the dimensions of a field, which is an array or a mapping to arrays.
 
     Args:
         names: names of the dimensions. Arrays may differ in the size of a common dimension.
@@ -199,12 +199,12 @@ def _array(shape: Any, mark: Dims, variable: Variable | None, model_index: int |
     if variable is None or variable.dims != ((MODELS, *mark.names) if model_index is not None else mark.names):
         raise ValueError(f"{label} has no values with dimensions {mark.names}")
     if not isinstance(shape, list) or len(shape) != len(mark.names) or not all(type(size) is int for size in shape):
-        raise ValueError(f"{label} has no shape of {len(mark.names)} whole numbers")
+        raise ValueError(f"{label} must have a shape of {len(mark.names)} whole numbers")
     if 0 in shape and min(shape) == 0:  # nested lists in JSON lose the other sizes
         return np.zeros(shape, mark.kind)
     data = variable.data if model_index is None else variable.data[model_index]
     if data.ndim != len(shape) or not all(0 < size <= most for size, most in zip(shape, data.shape, strict=True)):
-        raise ValueError(f"{label} must have the shape {shape}")
+        raise ValueError(f"{label} must have the shape {shape}, but its variable has {data.shape}")
     data = data[tuple(map(slice, shape))]
     array: np.ndarray = data.astype(mark.kind)
     if mark.kind is not float and (array != data).any():

@@ -10,7 +10,6 @@ from torch import Tensor
 from ...data.batch import Batch
 from ...data.sequences import (
     HeldOutWindows,
-    columns_of,
     interpolate_missing,
     mean_of_known,
     sequences,
@@ -21,10 +20,8 @@ from .evaluation_windows import EvaluationWindows
 
 Forecaster = Callable[[slice], Tensor]
 """Function from a slice of windows to forecasts (K, B, H, D)."""
-OF_ARRAYS = ("last value", "nearest neighbours")
-"""Default reference rows of windows without named columns."""
-OF_TABLES = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
-"""Default reference rows of windows with named columns."""
+USUAL = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
+"""Default reference rows of windows that name none."""
 
 _EXACT = "donot_use_mm_for_euclid_dist"
 
@@ -48,8 +45,8 @@ def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
 def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: Tensor | None = None) -> Tensor:
     """Return Euclidean distances `(N, M)` between `(N, D)` and `(M, D)`.
 
-    With missing coordinates, the mean square over the common ones is scaled to all of them. Points without a common
-    coordinate are infinitely far apart.
+    If coordinates are missing, the mean squared difference over the coordinates that both points have is multiplied by
+    D. Points without a common coordinate are infinitely far apart.
 
     Args:
         first, second: points, with any value at a missing coordinate.
@@ -167,7 +164,7 @@ def nearest_neighbours(
 
 @dataclass(frozen=True)
 class References:
-    """Forecasters without a model. `references["mean"]` is the number of forecasts of "mean", and its `Forecaster`.
+    """Forecasters without a model. Indexing by name returns the number of forecasts per window, and the `Forecaster`.
 
     | name | forecasts | needs |
     |---|---|---|
@@ -177,7 +174,8 @@ class References:
     | climatology | K futures of training windows, drawn at random for each window | training windows |
     | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
 
-    Windows may rename some of them by `windows.references`, {new name: name}, which are then the default rows.
+    Windows may rename some references by `windows.references`, {new name: name}. The renamed ones are then the default
+    rows.
 
     All but the last two are point forecasts: their energy score is a distance, their CRPS an absolute error, and they
     have no intervals. Climatology is the distribution of futures without knowledge of the past.
@@ -225,9 +223,8 @@ class References:
 
     @property
     def usual(self) -> list[str]:
-        """Available default rows of an evaluation: the names in the windows, or else the rows for their kind."""
-        names = self._names or (OF_TABLES if columns_of(self.held.windows) else OF_ARRAYS)
-        return [name for name in names if not self.missing_requirement(name)]
+        """Available default rows of an evaluation: from `windows.references`, or else all of `USUAL`."""
+        return [name for name in self._names or USUAL if not self.missing_requirement(name)]
 
     @property
     def _names(self) -> Mapping[str, str]:

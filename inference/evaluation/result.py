@@ -143,15 +143,15 @@ class Result(Displayed):
         return {}
 
     def check(self) -> None:
-        """Refuse fields that contradict each other, as in an altered file.
+        """Raise an error if fields contradict each other, as in an altered file.
 
         Raises:
-            ValueError: with the names of these fields.
+            ValueError: when fields contradict each other; the message names them.
         """
 
     @property
     def extents(self) -> Mapping[str, set[int]]:
-        """Sizes of the arrays by dimension; several if arrays differ in it."""
+        """Set of array sizes for each dimension, with several sizes if arrays differ."""
         return flatten(self).sizes
 
     @property

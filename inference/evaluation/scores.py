@@ -35,7 +35,7 @@ class Metric:
         unit: unit of the score.
         program: "free-running" or "teacher-forced".
         better: "lower", "higher", or "" for neither.
-        partial: whether the score is NaN for some clips, which are then omitted.
+        partial: whether the score may be NaN for some clips; its mean then omits them.
     """
 
     unit: str = ""
@@ -99,8 +99,8 @@ class Measure:
             The past has x `(B, O, D)`, its mask if there is one, and context.
         unit, better, partial: see `Metric`.
         pool: function of the scores of all windows, `(N, ...)`, and their clips; it returns a value for each clip. The
-            mean of these, weighted by windows, is the score. A score of the whole set returns pseudo-values, a
-            histogram lists of shares.
+            mean of these values, weighted by numbers of windows, is the score. The values are pseudo-values for a score
+            of the whole set, and lists of shares for a histogram.
         headline: whether the table of a comparison contains it.
         truth: name of a reference row that forecasts the true futures, if the score needs it as a comparison.
         note: line printed below the table.
@@ -110,9 +110,9 @@ class Measure:
             `function` returns shares `(B, bins)`.
         least: smallest number of forecasts of a window for this score; rows with fewer, such as point forecasts, omit
             it.
-        of_draws: whether it scores the distribution of the data; a note warns if forecasts are means.
-        of_means: whether it is published for means of the emission. Forecasts are then means by default; otherwise they
-            are draws.
+        of_draws: whether the score assesses the distribution of the data; a note warns if forecasts are means.
+        of_means: whether the score is published for means of the emission. Forecasts are then means by default;
+            otherwise they are draws.
     """
 
     name: str

@@ -159,7 +159,7 @@ class Run:
         """Write `config.json`.
 
         Raises:
-            TypeError: when the config contains other than JSON types.
+            TypeError: when the config contains values that JSON cannot represent.
         """
         content = json.dumps(config, indent=2).encode()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -250,7 +250,7 @@ class Run:
         except (ValueError, RecursionError) as error:
             raise CheckpointError(f"{path} is damaged, it is not JSON ({error}); fit again") from error
         if _depth(content) > 32:
-            raise CheckpointError(f"{path} is damaged, it is nested deeper than any that fit writes; fit again")
+            raise CheckpointError(f"{path} is damaged, it is nested deeper than any file that fit writes; fit again")
         if not isinstance(content, dict):
             raise CheckpointError(f"{path} is damaged: expected a JSON object, got {type(content).__name__}; fit again")
         return content
@@ -335,8 +335,12 @@ def state_bytes(model: nn.Module, copies: int = 1) -> int:
 def at_most(size: int, what: str) -> Iterator[None]:
     """Prevent this thread from building modules with more parameters and buffers than `size` allows.
 
-    The size of a file of weights limits the size of its model. Shared and rebuilt tensors count several times, which
-    the limit allows, because a number takes four bytes in a file, or two.
+    A number usually takes two or four bytes in a file of weights. The limit is one number per byte plus a margin,
+    because tensors that are shared or rebuilt count several times.
+
+    Args:
+        size: size of the file of weights in bytes.
+        what: subject of errors, such as the path of the run.
 
     Raises:
         CheckpointError: when the limit is exceeded.
@@ -371,10 +375,10 @@ def _check_names_and_shapes(model: nn.Module, tensors: Mapping[str, Tensor], pat
     actual = {name: tuple(value.shape) for name, value in tensors.items()}
     if expected == actual:
         return
-    problems = [f"it has no {name} {expected[name]}" for name in expected.keys() - actual.keys()]
-    problems += [f"it has {name} {actual[name]}, unlike the model" for name in actual.keys() - expected.keys()]
+    problems = [f"it has no {name} of shape {expected[name]}" for name in expected.keys() - actual.keys()]
+    problems += [f"it has {name} of shape {actual[name]}, unlike the model" for name in actual.keys() - expected.keys()]
     problems += [
-        f"{name} is {actual[name]}, the model's is {expected[name]}"
+        f"{name} has the shape {actual[name]}, but the model's has {expected[name]}"
         for name in expected.keys() & actual.keys()
         if expected[name] != actual[name]
     ]

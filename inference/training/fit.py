@@ -9,7 +9,7 @@ import signal
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,14 +67,15 @@ class Fit:
         history: rows of the log, in nats per step (see `trackers`).
         step: last step.
         best_step: step of the best unweighted validation bound; None without validation data.
-        best_bound: best validation bound, in nats per step; with scheduled sampling, of the program that reads its own
-            output; for a model without a likelihood, minus its objective.
+        best_bound: best validation bound, in nats per step. With scheduled sampling, it is the bound of the model that
+            reads its own output. For a model without a likelihood, or an objective that selects by "loss", it is minus
+            the validation loss.
         status: "finished", "stopped early" or "interrupted".
         run: run directory, or None.
         per: unit that bounds are divided by: a step, unless the model's `per` names another.
         model: fitted model with the best weights; None if only the log of a run was read.
-        processor_seconds: processor time of all threads of the first process, with validation and checkpoints; of a
-            resumed run, the total.
+        processor_seconds: processor time of all threads of the first process, including validation and checkpoints, in
+            seconds; for a resumed run, the total over all its parts.
         last_value: bound of a forecast that repeats the last value, on the validation windows (see `last_value`), for
             comparison with `best_bound`. None if the windows have no horizon, or the model's likelihood is not of the
             original data.
@@ -211,9 +212,9 @@ def fit(
         out: run directory for checkpoints and `log.jsonl` (see `checkpoints`). If a method is fitted to data that can
             be opened again, `dvae.load` and the command `dvae resume` read the run.
         resume: whether to continue the run in `out` from its last checkpoint up to `steps`.
-        config: description of the run in JSON types, for `config.json`; training options are added to it. A resumed run
-            keeps its own if none is given.
-        trackers: additional receivers of the log's rows.
+        config: description of the run in JSON types, for `config.json`; training options are added to it. If None, a
+            resumed run keeps its stored description.
+        trackers: additional trackers, which receive each row of the log.
         callbacks: hooks after steps, after validations and at the end.
         **options: fields of `Training`, such as steps=2000, batch_size=32, learning_rate=1e-3. For a method, the seed
             also determines its initial weights.
@@ -293,6 +294,27 @@ def _prepare_options(recipe: Recipe, model: nn.Module, options: Mapping[str, Any
     return {**options, **recipe_options}
 
 
+CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+"""Where Linux states how many cores a container may use."""
+
+
+def _thread_advice() -> str:
+    """Return a warning if torch has more threads than free cores, which makes small networks many times slower."""
+    threads, cores = torch.get_num_threads(), os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    with suppress(OSError, ValueError):  # a container's limit: "max 100000" or "200000 100000"
+        quota, period = CPU_LIMIT.read_text(encoding="ascii").split()
+        cores = min(cores, max(round(int(quota) / int(period)), 1))
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    if threads == 1 or (threads <= cores and busy <= 1.25 * cores):  # a fit before this one counts as busy, too
+        return ""
+    return (
+        f"torch uses {threads} threads on {cores} cores, where {busy:.1f} threads run; training can be many times "
+        "slower than on one thread; set OMP_NUM_THREADS=1 or call torch.set_num_threads(1)"
+    )
+
+
 def _fit(
     model: nn.Module,
     train: Any,
@@ -325,6 +347,8 @@ def _fit(
     with ExitStack() as stack:
         stack.callback(model.eval)
         state, first = svi.init(), svi.fabric.is_global_zero
+        if svi.fabric.device.type == "cpu" and (advice := _thread_advice()):
+            warnings.warn(advice, stacklevel=3)
         if run is not None and first:
             stack.enter_context(run.locked())
         processes.wait(svi.fabric)  # every process must look for an earlier run before the first one writes
@@ -376,8 +400,14 @@ def _observed(model: nn.Module, validation: Any) -> int | None:
 def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapping[str, Any]) -> Run | None:
     """Return the run directory, after checking that `fit` overwrites no run and resumes one on the same data.
 
+    Args:
+        out: path of the directory; None for no directory.
+        resume: whether to continue the run in the directory.
+        record: description of the run, for `config.json`, with the fingerprint of its training data.
+
     Raises:
-        CheckpointError: when there is a run although `resume` is False, none to resume, or one on other data.
+        CheckpointError: when `out` contains a run although `resume` is False, no run although it is True, or a run on
+            other data.
     """
     run = None if out is None else Run(out)
     if resume and (run is None or not run.exists):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 class GradNorm:
     """Objective with adaptive weights for named log-likelihoods and energies; `others` weighs all other terms.
 
-    With L_i minus a log-likelihood, or an energy, summed over the batch and divided by its frames,
+    Let L_i be a negative log-likelihood, or an energy, summed over the batch and divided by its number of frames. Then
 
         loss = sum_tasks w_i L_i + others(the other terms).
 
@@ -44,7 +44,7 @@ class GradNorm:
     Args:
         tasks: names of log-likelihoods and energies, at least two.
         shared: prefix of the names of the parameters W, such as a last layer that all tasks use.
-        others: objective that weighs all other terms, including the KL, and sets draws and selection.
+        others: objective that weighs all other terms, including the KL, and defines `draws` and `select`.
         asymmetry: a, the strength with which slowly training tasks are favoured. At 0, norms of gradients are
             equalised. Above 0, losses must be positive, which negative log densities need not be. The paper uses 0.12,
             and 1.5 if tasks differ more.
@@ -102,7 +102,7 @@ class GradNorm:
         costs = {name: -value for name, value in terms.log_likelihood.items()} | terms.energies
         if unknown := [task for task in self.tasks if task not in costs]:
             raise ValueError(
-                f"tasks names {', '.join(map(repr, unknown))}, but the log-likelihoods and energies are "
+                f"`tasks` includes {', '.join(map(repr, unknown))}, but the log-likelihoods and energies are "
                 f"{', '.join(costs) or 'none'}; set the weights of all other terms in others"
             )
         return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
@@ -113,7 +113,8 @@ class GradNorm:
         shared = [value for name, value in trained.items() if name.startswith(self.shared)]
         if not shared:
             raise ValueError(
-                f"no parameter's name starts with {self.shared!r} (shared); the parameters are {', '.join(trained)}"
+                f"`shared` is {self.shared!r}, but no parameter's name starts with it; "
+                f"the parameters are {', '.join(trained)}"
             )
         return Balance(self, shared)
 

@@ -84,10 +84,17 @@ def _discrete(model: DynamicalVAE) -> tuple[list[list[int]], Tensor]:
 
 
 def _spreads(x: Tensor, mask: Tensor, classes: Sequence[list[int]], discrete: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean (D,) and standard deviations (T, D).
+    """Return the mean (D,) of training windows, and the standard deviations (T, D) of their differences.
 
-    Row 0 is for deviations from the mean, row h for differences over h steps. For a class variable, the first
-    coordinate instead contains the probability of each class in row 0, and the probability of no change in later rows.
+    Row 0 is the standard deviation from the mean, and row h of differences over h steps. For a class variable, the
+    first coordinate instead contains the probability of each class in row 0, and the probability of no change in later
+    rows.
+
+    Args:
+        x: training windows (N, T, D).
+        mask: (N, T, D), True where an entry was observed.
+        classes: coordinates of each class variable.
+        discrete: (D,), True at other discrete coordinates.
     """
     count = mask.sum((0, 1)).clamp(min=1)
     mean = x.sum((0, 1)) / count
@@ -109,7 +116,13 @@ def _spreads(x: Tensor, mask: Tensor, classes: Sequence[list[int]], discrete: Te
 
 
 def _log_density(errors: Tensor, spread: Tensor, discrete: Tensor) -> Tensor:
-    """Return the log density of errors; for a discrete coordinate, the log probability of the interval around it."""
+    """Return the normal log density of errors (..., D); for a discrete coordinate, the log probability of its interval.
+
+    Args:
+        errors: values minus their forecast, (..., D).
+        spread: standard deviations, which broadcast to the errors.
+        discrete: (D,), True at discrete coordinates, which stand for the interval of length 1 around them.
+    """
     density = -0.5 * (errors / spread).square() - spread.log() - 0.5 * math.log(2 * math.pi)
     if not discrete.any():
         return density

@@ -73,7 +73,7 @@ class StatefulObjective(Objective, Protocol):
 
 @runtime_checkable
 class AdaptiveObjective(Protocol):
-    """Objective whose state is reset at each stage; called directly, it returns losses that can be compared."""
+    """Objective whose state is reset at each stage; called directly, it uses constant weights."""
 
     def begin(self, model: nn.Module) -> StatefulObjective:
         """Return the objective with its state for a stage; raise ValueError if the model does not fit."""

@@ -38,7 +38,7 @@ class Training:
         accelerator: kind of device: "auto", "cpu", "gpu", "cuda" or "mps".
         devices: number of devices, with one process each; under torchrun, the number of processes on this host.
         precision: precision of the computation; "32-true" keeps the model's own.
-        progress: whether to show the terms on the terminal.
+        progress: whether to show a progress bar with the terms of the bound on the terminal.
 
     Raises:
         ValueError: when an option is out of range.

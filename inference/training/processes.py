@@ -5,7 +5,7 @@ averaged, as if one process had all these batches. They are sent together with t
 are small and the number of messages costs more than their size. torch's own wrapper sends gradients in buckets, copies
 buffers at every pass, and refuses a parameter without a gradient.
 
-lightning-fabric starts the processes on one machine, torchrun those on several (`docs/scaling.md`).
+lightning-fabric starts the processes on one machine, torchrun those on several (`docs/how-to/scale_and_gpus.md`).
 """
 
 import atexit
@@ -94,7 +94,7 @@ def average_gradients(
 ) -> tuple[Tensor, Tensor | float]:
     """Average gradients over processes, weighted by frames, as for one batch of the sequences of all processes.
 
-    A parameter without a gradient in every process still has none.
+    A parameter that has no gradient in any process remains without one.
 
     Args:
         fabric: fabric of the processes.
@@ -164,12 +164,13 @@ def _check(training: Training) -> None:
         )
     if devices > 1 and not is_torchrun() and sys.argv[0] in ("", "-", "-c"):
         raise ValueError(
-            f"devices={devices} starts {devices} copies of the program, which must be in a file; write it to a file"
+            f"devices={devices} starts {devices} copies of the program, which must be in a file; "
+            "save it as a .py file and run that file"
         )
 
 
 def _count_processes(devices: int) -> tuple[int, int]:
-    """Return the numbers of processes on this host and of hosts."""
+    """Return the number of processes on this host, and the number of hosts."""
     if not is_torchrun():
         return devices, 1
     local_processes, all_processes = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])

@@ -90,10 +90,10 @@ class Trainable:
         return self.trainings.get(Schema.of(data).preset, self.trainings[""])
 
     def check(self) -> None:
-        """Refuse options that conflict, before any data are read.
+        """Raise an error if options conflict, before any data are read.
 
         Raises:
-            ValueError: with the names of the options that conflict.
+            ValueError: when options conflict; the message names them.
         """
         with suppress(SchemaError):
             self.build(Schema({"x": 1}))

@@ -181,9 +181,9 @@ def _restore_objective(objective: StatefulObjective, run: Run, tensors: Mapping[
     if tensors.keys() != own_state.keys():
         names = reprlib.repr(list(tensors)) if tensors else "none"
         raise CheckpointError(
-            f"{run.path} was fitted with another objective: its state has {names}, this one's has "
-            f"{', '.join(own_state)}; resume with the objective and stages of the fit. (Stages with other steps begin "
-            "at other steps.)"
+            f"{run.path} was fitted with another objective: its state has {names}, that of the given objective has "
+            f"{', '.join(own_state)}; resume with the objective and stages of the fit. (Stages with other numbers of "
+            "steps begin at other steps.)"
         )
     for name, value in own_state.items():
         tensor = tensors[name]

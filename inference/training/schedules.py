@@ -190,6 +190,11 @@ def clamp(value: Any, steps: int, name: str = "") -> Any:
 
     A schedule that is too long is compressed as a whole, delay and steps in proportion, so that it reaches its end
     value. Mappings and dataclasses are searched for schedules; anything else is returned unchanged.
+
+    Args:
+        value: a schedule, a mapping or dataclass with schedules, or anything else.
+        steps: number of steps of the training.
+        name: name of the value, for warnings.
     """
     if isinstance(value, Schedule):
         end = _end(value)

@@ -235,7 +235,7 @@ class SVI:
         The draws from the guide are the same at each call, so bounds differ only by the weights. Processes share the
         data, and each returns the terms of all data. The row of a model without a likelihood has a "loss" instead of a
         bound. An objective that selects by "loss" adds it to the row. A run with scheduled sampling adds
-        "self_fed/bound", the bound with the feeding at the end of the run.
+        "self_fed/bound", the bound with the scheduled-sampling probability at the end of the run.
 
         Args:
             data: x as a tensor (N, T, D), a batch, an object whose `all()` returns a batch, or one whose
@@ -294,7 +294,7 @@ class SVI:
         return processes.sum_over_processes(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Return the mean over processes of a value per frame of the last step, weighted by numbers of frames."""
+        """Return the mean over processes of a value per frame, weighted by their numbers of frames in the last step."""
         return self.total(value * self._share)
 
     def settle(self) -> None:
@@ -323,7 +323,12 @@ class SVI:
         return {"torch": torch.get_rng_state(), **cuda}
 
     def _score(self, data: Batched, feeding: float) -> dict[str, float]:
-        """Return the unweighted terms on held-out data, per frame, with the same draws at each call."""
+        """Return the unweighted terms on held-out data, per frame, with the same draws at each call.
+
+        Args:
+            data: held-out data.
+            feeding: probability of scheduled sampling; 0 to read the true past.
+        """
         objective = stage_at(self.plan, self.state.step)[1].objective
         last = self.training.steps  # the last weights of the schedules, so that losses can be compared
         self.settle()
@@ -352,7 +357,15 @@ class SVI:
     def _terms(
         self, batch: AnyBatch, objective: Objective, location: str, feeding: float, curriculum: float | None = None
     ) -> Terms:
-        """Return the terms of a batch that the objective needs, on the device of the model."""
+        """Return the terms of a batch that the objective needs, computed on the device of the model.
+
+        Args:
+            batch: x as a tensor (B, T, D), or a batch.
+            objective: objective that determines the numbers of draws.
+            location: place in the run, for errors, such as "step 3".
+            feeding: probability of scheduled sampling.
+            curriculum: progress of the curriculum, from 0 to 1; None for a model without one.
+        """
         refuse_table(batch)
         converted = Batch(batch if isinstance(batch, Mapping) else {"x": batch}).map(tensor_of)
         if not isinstance(self.model, DynamicalVAE):  # a DynamicalVAE converts to its own precision

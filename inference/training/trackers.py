@@ -1,8 +1,8 @@
-"""Trackers: receivers of a run's log, such as a history, a file of JSON lines, TensorBoard or the terminal.
+"""Trackers, which receive the log of a run: a list, a file of JSON lines, TensorBoard or the terminal.
 
 A row maps names to numbers, in nats per frame. `bound`, `log_likelihood/x` and `kl/z` are of a training batch, and with
-the prefix `validation/` of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling` are
-of the step; so is `weight/x` for an objective with adaptive weights.
+the prefix `validation/` of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling`
+describe the step, as does `weight/x` for an objective with adaptive weights.
 """
 
 import io
@@ -28,10 +28,10 @@ MOST_ROWS = 200_000
 
 
 class Tracker(Protocol):
-    """Receiver of the rows of a run."""
+    """Interface of a tracker, which receives each row of a run's training log."""
 
     def start(self, step: int) -> None:
-        """Start at a step, and drop stored rows of later steps, which belong to an abandoned run."""
+        """Prepare for rows after a step, and drop stored rows of later steps, which the resumed run repeats."""
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
         """Store a row."""

@@ -33,8 +33,9 @@ class ACLSTM(DeterministicMethod):
 
     Args:
         shown: number of frames of the data in a block.
-        own: number of frames of its own output in the following block.
-        scheduled_sampling: probability that a frame of the second block is its own output instead of the data.
+        own: number of frames of the network's own output in the following block.
+        scheduled_sampling: probability that a frame of the second block is the network's own output instead of the
+            data.
     """
 
     name = "aclstm"

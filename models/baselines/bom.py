@@ -4,7 +4,7 @@
 
 The loss has the squared error of the best draw from the guide for each window, instead of the mean over all draws. The
 other draws are therefore free to differ (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). It has the networks
-of the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386, as in the tables of motion prediction.
+of the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386, as in published comparisons of motion prediction.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 The parts of the body are predicted one after the other, as in GSPS (Mao, Liu and Salzmann, 2021, arXiv 2108.08422, eq.
 14), and can be controlled in the same way. Training minimises the squared error of the best of ten futures after the
-observed frames (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). The other energies of GSPS are
-omitted. It is the row "BoM with Eq. 14" of GSPS's table of control.
+observed frames (Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772). The other energies of GSPS are omitted. It
+is the row "BoM with Eq. 14" of GSPS's table on controlled prediction.
 
 The paper on GSPS does not describe its implementation. Our choices: the guide is the prior, since GSPS has no other
 guide, and each of the ten futures has its own latent of each part.
@@ -29,7 +29,7 @@ SAMPLES = 10
 
 @dataclass(frozen=True)
 class BoMParts(GSPS):
-    """BoM by parts: the options of GSPS, with 0 for weights of other energies, and `draws` for ten futures."""
+    """BoM by parts: GSPS with only the error of the best future, from ten futures of each window by default."""
 
     name = "bom-parts"
     source = "Bhattacharyya, Schiele and Fritz, 2018, arXiv 1806.07772"

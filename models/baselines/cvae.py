@@ -3,12 +3,12 @@
     p(w) p(x_t | x_{<t}, h, w)        q(w | x_{1:T}, h)
 
 One recurrent network summarises the observed poses h for guide and decoder, and another the future x for the guide. The
-decoder reads the summary of h, w and its own mean at t-1 (at first the last observed pose) in place of x_{t-1}.
-Gradients flow through these means. Poses are absolute.
+decoder reads the summary of h, w and, in place of x_{t-1}, its own mean at t-1. At the first step it reads the last
+observed pose instead. Gradients flow through these means. Poses are absolute.
 
 Yuan and Kitani, 2020, arXiv 2003.08386, with 725,292 parameters for Human3.6M. With a mixture of normals as the prior,
-it is GMVAE (Dilokthanakul et al., 2016, arXiv 1611.02648) without its further latents, as in the tables of motion
-prediction.
+it is GMVAE (Dilokthanakul et al., 2016, arXiv 1611.02648) without its further latents, as in published comparisons of
+motion prediction.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ class SummaryEncoder:
 
     Args:
         width: width of the states.
-        hidden: widths of the perceptron on both.
+        hidden: widths of the perceptron that reads both states.
     """
 
     width: int
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummaryEncoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return SummaryEncoderNetwork(self, inputs)
 
 
@@ -109,7 +109,7 @@ class SummaryDecoder:
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummaryDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return SummaryDecoderNetwork(self, inputs, size)
 
 

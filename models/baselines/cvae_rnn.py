@@ -4,8 +4,8 @@
 
 The stochastic baseline of TrajeVAE, with the same variables: y are the given trajectories, r the remaining joints, s
 the first pose. Bidirectional recurrent networks summarise y and r; their states are averaged over time. The decoder
-reads the summary of y, w, y_t and its own mean at t-1 (at first s) in place of x_{t-1}, in training too. Gradients flow
-through these means. Poses are absolute.
+reads the summary of y, w, y_t and, in place of x_{t-1}, its own mean at t-1, in training too. At the first step it
+reads s instead. Gradients flow through these means. Poses are absolute.
 
 Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, after the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. The
 positions of the perceptrons are our choice, which reproduces the paper's sizes and number of parameters (913,883 for
@@ -56,7 +56,7 @@ class CVAERNN(LatentTrajectoryMethod):
         skeleton: {**preset, "beta": 0.1 if skeleton else 1e-4}
         for skeleton, preset in LatentTrajectoryMethod.presets.items()
     }
-    """The KL weight is the paper's for its skeletons, otherwise tuned on the tuning split (docs/results/tuning.md)."""
+    """The KL weight has the paper's value for the paper's skeletons; others are tuned (benchmarks/results/tuning)."""
     trainings: ClassVar[Mapping[str, Training]] = {
         **LatentTrajectoryMethod.trainings,
         "": Training(12_000, 16, 1e-3, 0.5),
@@ -70,7 +70,7 @@ class CVAERNN(LatentTrajectoryMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.hidden:
-            raise ValueError("hidden is empty; a perceptron has at least one layer")
+            raise ValueError("hidden is empty; a perceptron has at least one layer, so give at least one width")
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -107,7 +107,7 @@ class Summaries:
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SummariesNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return SummariesNetwork(self, inputs)
 
 
@@ -149,7 +149,7 @@ class Decoder:
 
     Args:
         summary: units of the summary, for each direction.
-        hidden: widths of the perceptrons; the one after the states omits the last.
+        hidden: widths of the perceptrons; the perceptron after the states has no layer of the last width.
         width: units of the state.
     """
 
@@ -158,7 +158,7 @@ class Decoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return DecoderNetwork(self, inputs, size)
 
 

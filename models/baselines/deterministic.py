@@ -4,9 +4,9 @@
 
 A forecast continues from its own means. All K futures are therefore equal, and their diversity is 0.
 
-Our additions: networks read and predict standardised poses, by the mean pose and one scale. Windows may be rotated so
-that the last observed pose faces one way, which helps on small data sets. For skeletons that the papers do not use,
-networks are small.
+Our additions: networks read and predict poses that are standardised by the mean pose and one scale. Windows may be
+rotated so that the last observed pose faces one way, which helps on small data sets. For skeletons that the papers do
+not use, networks are small.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         latent: always None; the method has no latents.
         emission: distribution of x. By default the distributions of a table's columns, or a normal with variance 1/2,
             whose negative log-density is the squared error. With any other emission, forecasts are draws.
-        width: width of the LSTMs' states; by default the paper's for Human3.6M and HumanEva, and 256 for others.
+        width: width of the LSTMs' states; by default the paper's value for Human3.6M and HumanEva, and 256 for other
+            skeletons.
         layers: number of LSTMs, each on the states of the previous one.
         standardise: whether networks read and predict standardised x, by its mean and one scale (`dvae.data.units`).
         heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures
@@ -77,7 +78,7 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset, without headings if left and right of the skeleton are unknown."""
+        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
         preset = super().preset(skeleton)
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
@@ -90,7 +91,10 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         return self.with_presets({**self.presets[""], "heading": False})
 
     def fed(self) -> ScheduledSampling | InputNoise:
-        """Return what replaces the data's history in training; a schedule sets its level."""
+        """Return what the network reads in training in place of the true past: its own output, or noisy data.
+
+        A schedule sets the probability of its own output, or the scale of the noise.
+        """
         raise NotImplementedError
 
     @override

@@ -13,8 +13,8 @@ loss then includes the squared distance of the held joints from their positions 
 
 Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code. For Human3.6M, the network has
 2,038,528 parameters with 10 modes and 7,291,648 with 50 modes, without the decoder. Our choices are the weight of held
-joints, the heading, and lambda and s for other data. These are the values of HumanEva, whose windows have as many
-frames.
+joints, the heading, and lambda and s for other data. For lambda and s we use the values of HumanEva, whose windows have
+as many frames.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ PRESETS = table(
         "": (*SHAPE, 10, 50.0, 20.0, True),
     },
 )
-"""Options by skeleton: the paper's, and ours for other skeletons."""
+"""Options by skeleton: the paper's values, and our values for other skeletons."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,11 @@ class DLow(ModesMethod):
     Args:
         beta: weight of the KL divergence of each mode's latents from N(0, I).
         diversity: lambda, weight of the similarity of the futures; None, here and below, for the preset.
-        diversity_scale: s, in square metres.
+        diversity_scale: s, squared distance of two futures at which their similarity is 1 / e, in square metres.
         reconstruction: weight of the squared error of the best future.
-        held: parts of the body, or joints, with the same motion in all modes, such as lower.
-        hold: weight of the squared distance of held joints from the first mode, mean over the other modes.
+        held: parts of the body, or joints, with the same motion in all modes, such as "lower".
+        hold: weight of the squared distance of held joints from their positions in the first mode, averaged over the
+            other modes.
     """
 
     name = "dlow"
@@ -114,7 +115,9 @@ class DLowModel(ModesModel):
     def __init__(self, method: DLow, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
         super().__init__(method, frames, skeleton, **options)
         if method.held and skeleton is None:
-            raise SchemaError(f"held names {', '.join(method.held)}, but the data have no skeleton; pass poses to dlow")
+            raise SchemaError(
+                f"held names {', '.join(method.held)}, but the data have no skeleton; fit dlow to windows of poses"
+            )
         held_joints = set(places_of(skeleton, method.held)) if skeleton else set()
         parts = [
             [c for c in range(self.sizes[WHOLE]) if (c // 3 in held_joints) == is_held] for is_held in (True, False)

@@ -12,8 +12,7 @@ Distances are over all frames and coordinates. R is the radius of the ball that 
 keeps the futures near the data.
 
 Yuan and Kitani, 2020, arXiv 1907.04967; we know of no public code. Our choices are omega and rho. The network, its
-number of modes and the distances s are from DLow (arXiv 2003.08386), as the tables of motion prediction compare the
-two.
+number of modes and the distances s are from DLow (arXiv 2003.08386), as in published comparisons of the two.
 """
 
 from __future__ import annotations
@@ -48,9 +47,10 @@ class DSF(ModesMethod):
 
     Args:
         beta: weight of half the squared norm of the latents, mean over modes; the paper has no such term.
-        diversity_scale: s, in square metres; by default as in DLow.
-        quality: omega, quality of a latent within the radius.
-        radius: rho, share of N(0, I) within the radius.
+        diversity_scale: s, squared distance of two futures at which their similarity is 1 / e, in square metres; by
+            default as in DLow.
+        quality: omega, quality of a latent within the radius R.
+        radius: rho, probability under N(0, I) of a latent within the radius R, which determines R.
     """
 
     name = "dsf"
@@ -69,7 +69,7 @@ class DSF(ModesMethod):
 
     @override
     def objective(self) -> Objective:
-        """Return minus the expected number of futures, per frame as in `Evidence`."""
+        """Return minus the expected number of selected futures, per frame as in `Evidence`."""
         weights = {"cardinality": 1.0}
         weights |= {"norm": self.beta} if self.beta else {}
         weights |= {"join": self.join} if self.join else {}

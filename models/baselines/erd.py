@@ -35,8 +35,8 @@ class ERD(DeterministicMethod):
     """The encoder-recurrent-decoder.
 
     Args:
-        encoder: widths of the perceptron before the LSTMs; default as for `width`.
-        decoder: widths of the perceptron after the LSTMs; default as for `width`.
+        encoder: widths of the perceptron before the LSTMs; the default depends on the skeleton, as for `width`.
+        decoder: widths of the perceptron after the LSTMs; the default depends on the skeleton, as for `width`.
         noise: final standard deviation of the noise on the input in training, relative to the scale of x. It rises
             from 0 over a third of training, after the first tenth. 0 for none.
     """

@@ -13,15 +13,17 @@ Henter, Alexanderson and Beskow, 2020, arXiv 1905.06598. `PAPER` has its sizes. 
 choices were not applicable or worked less well:
 
 * One recurrent network serves all couplings, which are perceptrons. In the paper each coupling has its own LSTM, and
-  also reads the last ten frames. Its states depend on the coupling's input at every frame, even a dropped one; in our
-  network a dropped frame is lost. Dropout rates of .95 (locomotion in the paper) and .7 (the baseline in
-  TrajeVAE's tables: Kania et al., 2021) would therefore leave little of the past. The default is no dropout.
-* There is no control signal; covariates of a table are read as by other methods.
+  also reads the last ten frames. The states of these LSTMs depend on the coupling's input at every frame, even a
+  dropped one; in our network a dropped frame is lost. Dropout rates of .95 (locomotion in the paper) and .7 (the
+  baseline in TrajeVAE's tables: Kania et al., 2021) would therefore leave little of the past. The default is no
+  dropout.
+* There is no control signal; covariates of a table are read as in other methods.
 * Location and scale before the flow also read h_t, and the location keeps a share of x_{t-1} (`residual`). In the paper
-  only couplings read the past, and a frame is a pose. The baseline of TrajeVAE adds its draw to the last pose.
+  only couplings read the past, and the flow returns the pose, not its change. The baseline of TrajeVAE adds its draw
+  to the last pose.
 * A coupling multiplies by a factor between exp(-`bound`) and exp(`bound`), in the paper by sigmoid(k + 2) + 1e-6. Draws
   divide by this factor. With a bound of 2, one in nine draws left the range of the data and never returned (bandai2's
-  tuning split, docs/results/tuning.md).
+  tuning split, benchmarks/results/tuning).
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@
     p(x_t | y_{1:T}, s)        no guide: there are no latents, and the likelihood is exact
 
 The first pose s and the given trajectories y are the columns of an image with a row for each coordinate. Values are
-standardised, and 0 (also the mean) where unknown. Convolutions and pooling halve the image repeatedly, and transposed
-convolutions restore its size, without skip connections. The output is the motion. Training minimises its absolute
-error: x has a Laplace distribution with a scale of one metre, whose negative log-density is this error plus a constant.
+standardised, and unknown values are 0, which is also the mean. Convolutions and pooling halve the image repeatedly, and
+transposed convolutions restore its size, without skip connections. The output is the motion. Training minimises its
+absolute error: x has a Laplace distribution with a scale of one metre, whose negative log-density is this error plus a
+constant.
 
 In training, either a gap in time hides the paths, or some joints have no path. A curriculum widens the gaps and removes
 more joints.
@@ -14,7 +15,7 @@ Kaufmann, Aksan, Song, Pece, Ziegler and Hilliges, 2020, arXiv 2010.11531, with 
 public implementation, whose network for gaps of any width has 4,703,425 parameters. It is a baseline in TrajeVAE's
 tables (arXiv 2104.00351). Our differences:
 
-* Widths of gaps are shares of a window; the paper has numbers of frames.
+* Widths of gaps are shares of a window; the paper gives them in frames.
 * The curriculum rises linearly.
 * Each window draws independently whether it has a gap or removed joints.
 * Joints are removed over the curriculum, not over all of training.
@@ -56,14 +57,14 @@ PRESETS = table(
     "maps heading",
     {"human36m": ((32, 64, 128, 256, 256), False), "": ((8, 16, 32, 64, 64), True)},
 )
-"""Options by skeleton: the paper's; for other skeletons, options that train in minutes on a CPU."""
+"""Options by skeleton: the paper's values; for other skeletons, values that train in minutes on a CPU."""
 
 HIDDEN = "hidden"
 """Key in training batches: the value of the curriculum from which an entry of y is hidden, (B, T, D)."""
 NARROWEST, SPREAD = 1 / 12, 1 / 6
 """Initial mean width of gaps and its standard deviation, relative to the final mean width."""
 IN_TIME, JOINTS = 0.7, 3
-"""Share of windows with a gap in time, and the largest number of joints removed from the others."""
+"""Share of windows with a gap in time, and the largest number of joints removed from each other window."""
 NEVER = 2.0
 """Value that no curriculum reaches, because curricula end at 1."""
 
@@ -75,9 +76,9 @@ class MotionInfilling(TrajectoryMethod):
     Args:
         latent: always None; the method has no latents.
         maps: numbers of feature maps at each image size, starting with the full size.
-        keep: probability that a joint is given, in training, where no gap hides it.
-        gap: final mean width of the gaps in training, as a share of the window; 0 for neither gaps nor removed joints,
-            as in the training of other methods, which have a `keep` below 1.
+        keep: probability in training that a joint of a window is given, before gaps and removed joints.
+        gap: final mean width of the gaps in training, as a share of the window. With 0 there are neither gaps nor
+            removed joints; set `keep` below 1 to hide joints as in other methods.
         curriculum: share of training over which gaps widen, after its first twentieth; 0 for wide gaps from the start.
     """
 
@@ -135,7 +136,7 @@ class MotionInfilling(TrajectoryMethod):
 
 
 def start(model: InfillingModel, train: Windows) -> None:
-    """Set the network's mean and scale from 1024 windows, as the model sees them."""
+    """Set the mean and scale of a model's network from 1024 training windows, in the model's view."""
     data = model.read(train.sample(1024, torch.default_generator))
     model.generator[WHOLE].network.units.fit(interpolate_missing(data[WHOLE], data.mask()))
 
@@ -144,9 +145,11 @@ def start(model: InfillingModel, train: Windows) -> None:
 class RandomGaps:
     """Windows with given trajectories, where a curriculum hides a gap in time or the paths of some joints.
 
-    For each entry, batches contain the value of the curriculum that hides it, so that hidden entries remain hidden. A
-    gap of width w and position u, in a window of length 1, extends from u (1 - w) to u + (1 - u) w. Its range over u
-    covers the whole window, and it grows to both sides with w.
+    Batches contain a threshold for each entry. The entry is hidden if the curriculum is at least at this threshold, so
+    hidden entries remain hidden as the curriculum rises.
+
+    A gap of width w and position u, in a window of length 1, extends from u (1 - w) to u + (1 - u) w. Gaps at different
+    u together cover the whole window. With increasing w, a gap grows to both sides.
 
     Args:
         source: source of the windows.
@@ -190,7 +193,7 @@ class RandomGaps:
 
 
 class InfillingModel(TrajectoryModel):
-    """A model of one motion given its first pose and some trajectories; batches may hide parts of these."""
+    """A model that completes a motion from its first pose and some trajectories; batches may hide parts of them."""
 
     @property
     @override
@@ -216,7 +219,9 @@ class InfillingModel(TrajectoryModel):
 
 @dataclass(frozen=True)
 class Infiller:
-    """A sequence (B, T, D) from its first step s and y, with 0 where unknown, by convolutions over both axes.
+    """Network that completes a sequence (B, T, D) by convolutions over time and coordinates.
+
+    It reads the first step s and the given trajectories y, which are 0 where unknown.
 
     At each size, the image of all frames passes through two 3 x 3 convolutions with leaky ReLU. Pooling then halves it,
     rounding up, with at least two rows left. Any length is therefore possible.
@@ -228,7 +233,7 @@ class Infiller:
     maps: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> InfillerNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return InfillerNetwork(self, inputs, size)
 
 

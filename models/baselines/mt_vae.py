@@ -10,7 +10,7 @@ content and style. LN is layer normalisation without gain:
 
 The decoder reads the new style at every step, and no pose. For J joints and D numbers of w, the loss is
 
-    sum_t |x_t - mean_t| / J  +  a 5 sum_{t <= 8} |velocity_t - made velocity_t| / J  +  a max(KL / D, .01)
+    sum_t |x_t - mean_t| / J  +  a 5 sum_{t <= 8} |velocity_t - generated velocity_t| / J  +  a max(KL / D, .01)
       +  5 |w' - w''| / D,                                                              a = 1 - .99995^step
 
 w' is a draw from the prior, and w'' a draw from the guide given the style that results from w'. The velocity term also
@@ -57,7 +57,7 @@ from ..motion.poses import table
 PRESETS = table(
     "latent width heading", {**dict.fromkeys(("human36m", "humaneva"), (512, 1024, False)), "": (64, 128, True)}
 )
-"""Options by skeleton: the public code's, and smaller ones for other skeletons."""
+"""Options by skeleton: the values of the public code, and smaller values for other skeletons."""
 FIRST = 8
 """Number of frames whose velocities enter the loss."""
 STEEPNESS = 3.0
@@ -72,7 +72,8 @@ class MTVAE(FutureMethod):
         latent: size of w.
         beta: limit of the rising weight of the KL; training ends at .95 of it.
         width: units of the recurrent networks and of embeddings; half of an embedding is style.
-        velocity: weight of the first velocities relative to positions; it rises like the weight of the KL.
+        velocity: weight of the error of the first velocities, relative to the error of positions; it rises like the
+            weight of the KL.
         cycle: weight of the cycle from latent to style and back.
         floor: nats for each number of w, averaged over the batch, below which the KL is not penalised.
     """
@@ -148,7 +149,7 @@ class MTVAEModel(FutureModel):
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """Return errors of the first velocities, for draws of guide and prior, and the cycle error of the latter."""
+        """Return errors of the first velocities for draws of guide and prior, and the cycle error of the prior."""
         penalties, method = super().penalties(rollout, data, draws), self.method
         assert isinstance(method, MTVAE)
         if WHOLE not in data or not (method.velocity or method.cycle):
@@ -187,7 +188,7 @@ class ChangeEncoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> ChangeEncoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return ChangeEncoderNetwork(self, inputs)
 
 
@@ -221,7 +222,7 @@ class StyleDecoder:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> StyleDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return StyleDecoderNetwork(self, inputs, size)
 
 
@@ -248,7 +249,7 @@ class StyleDecoderNetwork(FixedLengthNetwork):
         )
 
     def changed(self, style: Tensor, w: Tensor) -> Tensor:
-        """Return the new style (B, S)."""
+        """Return the new style (B, S), from the style of the past (B, S) and the latent w (B, D)."""
         inputs = torch.cat([normed(self.read(w)), style], -1)
         return normed(normed(self.out(normed(self.block(inputs)))) + style)
 
@@ -280,7 +281,7 @@ class Embedding(nn.Module):
 
 
 class NormedLSTM(nn.Module):
-    """An LSTM with layer-normalised gates, each over its units, and cells (Ba et al., 2016, arXiv 1607.06450).
+    """An LSTM whose cells and gates, each over its units, are layer-normalised (Ba et al., 2016, arXiv 1607.06450).
 
     Args:
         size: D, size of the input.
@@ -298,7 +299,7 @@ class NormedLSTM(nn.Module):
         """Return states (B, T, W).
 
         Args:
-            shares: contributions of the input to the gates, (B, 4 W), by step.
+            shares: contribution of the input to the gates at each step, (B, 4 W).
             hidden, cell: first state, (B, W) each.
         """
         states, weight = [], self.recurrent.weight.t()

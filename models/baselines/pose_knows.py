@@ -6,7 +6,7 @@ Latents are independent of each other, so that futures jitter. The guide's state
 poses h. The decoder is the CVAE's, whose perceptron reads the state and z_t.
 
 Walker, Marino, Gupta and Hebert, 2017, arXiv 1705.00053; we know of no public code. The sizes are from the CVAE of Yuan
-and Kitani, 2020, arXiv 2003.08386, as the tables of motion prediction compare the two.
+and Kitani, 2020, arXiv 2003.08386, as in published comparisons of motion prediction.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class FutureFilter:
     width: int
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureFilterNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureFilterNetwork(self, inputs)
 
 

@@ -2,9 +2,9 @@
 
     p(w) p(x_t | x_{<t}, h, w)        q(w), the prior
 
-The decoder is the one of the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. It reads the sum of the code of h and
-W w, with W learned; there is no encoder of w. Training minimises the squared error of draws from the prior. Its minimum
-has W = 0, where all draws predict the mean. Futures only differ as long as training has not reached it.
+The decoder is the one of the CVAE of Yuan and Kitani, 2020, arXiv 2003.08386. It reads the sum of the code of h and W
+w, with W learned; there is no encoder of w. Training minimises the squared error of draws from the prior. Its minimum
+has W = 0, where all draws predict the mean. Futures therefore differ only before training reaches this minimum.
 
 It is the generator of HP-GAN (Barsoum, Kender and Liu, 2018, arXiv 1711.09561) without its adversary, as a baseline of
 Mix-and-Match (Aliakbarian et al., 2020, arXiv 1908.00733). HP-GAN's own generator has two layers of 1024 units,
@@ -49,7 +49,9 @@ class RHP(FutureMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.beta:
-            raise ValueError(f"beta is {self.beta}, but rhp's guide is its prior, so that the KL is 0; leave it out")
+            raise ValueError(
+                f"beta is {self.beta}, but rhp's guide is its prior, so that the KL is 0; leave `beta` at 0"
+            )
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -77,7 +79,7 @@ class PerturbedDecoder:
     hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> PerturbedDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return PerturbedDecoderNetwork(self, inputs, size)
 
 

@@ -39,12 +39,12 @@ class Gated:
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GatedTransition:
-        """Return the network of a factor whose first parent is its last value; other parents are static or at t."""
+        """Return the network of a factor p(z_t | z_{t-1}, ...), z_{t-1} first; other parents are static or at t."""
         fits = bool(inputs) and inputs[0].lags == (-1,) and inputs[0].size == size
         if not fits or any(parent.relation and parent.lags != (0,) for parent in inputs[1:]):
             raise ValueError(
-                f"a gated transition reads the last value of its variable and parents that are static or at t, got "
-                f"{inputs}"
+                "a gated transition needs z_{t-1} as first parent of z_t, and other parents that are static or at t; "
+                f"got {inputs}"
             )
         return GatedTransition(inputs, size)
 
@@ -69,7 +69,7 @@ class GatedTransition(Network):
         return torch.cat([mean, functional.relu(proposal)], dim=-1)
 
     def _other_parents(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
-        """Return the parents other than z_{t-1}, (B, T, E)."""
+        """Return the parents other than z_{t-1}, concatenated to (B, T, E), for `batch` sequences of `length` steps."""
         empty = self.linear.weight.new_empty(batch, length, 0)
         return torch.cat(aligned([empty, *(parents[name] for name in self.others)]), -1)
 

@@ -51,7 +51,10 @@ class LayeredNetwork(Network):
         super().__init__(inputs, local, spec.width)
         for parent in inputs:
             if parent.relation not in (None, ALL):
-                raise ValueError(f"Layered reads its parents over {{1:T}}, but {parent.name} has {parent.relation}")
+                raise ValueError(
+                    f"a Layered network reads local parents over {{1:T}}, but {parent.name} has {parent.relation}; use "
+                    "another network, such as Recurrent"
+                )
         recurrent = Recurrent(spec.width)
         self.past = Memory(recurrent, [(p, 0 if p.relation is None else -1) for p in inputs], +1)
         self.future = Memory(recurrent, [(p, 0) for p in inputs], -1)

@@ -50,7 +50,7 @@ class Equations(LatentMethod):
         for name in ("generative", "inference"):
             if lag := re.search(r"\d{4,}", getattr(self, name)):
                 raise ValueError(
-                    f"{name} has a lag of {lag[0][:20]} steps; a lag is at most 999, or write {{<t}} for any"
+                    f"{name} has a lag of {lag[0][:20]} steps; a lag is at most 999; for all past steps write {{<t}}"
                 )
 
     @override
@@ -95,8 +95,9 @@ class Equations(LatentMethod):
         schema = Schema.of(data)
         if missing := [name for name in self._context() if name not in schema.sizes]:
             raise SchemaError(
-                f"the equations read {', '.join(missing)}, which has no factor and must be in the data, but they have "
-                f"{', '.join(schema.sizes)}; a table has covariates as c, attributes as s, and uneven steps as d"
+                f"the equations read {', '.join(missing)}, which has no factor and must be in the data, but the data "
+                f"have {', '.join(schema.sizes)}; a table gives covariates as c, attributes as s, and uneven time "
+                "steps as d"
             )
         return self.build_for_data(schema, extended=False)
 

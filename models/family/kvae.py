@@ -12,8 +12,8 @@ is the resulting pair:
 
     p(a_t | a_{<t}) p(x_t | a_t)        q(a_t | x_t)
 
-p(a_t | a_{<t}) is the prediction of the Kalman filter. Its KL divergence is analytic, whereas the paper draws z, and
-forecasts propagate the whole distribution of z_t. `smooth` returns the posterior of z. The guide reads only x_t,
+p(a_t | a_{<t}) is the prediction of the Kalman filter. Its KL divergence is analytic, and forecasts propagate the whole
+distribution of z_t; the paper draws z. `smooth` returns the posterior of z. The guide reads only x_t,
 whereas the posterior of a_t also depends on the past a_{<t} and on later frames.
 
 A frame without any observed entry is not encoded: its a_t is integrated out like z, and contributes nothing to filter
@@ -66,9 +66,10 @@ class KVAE(LatentMethod):
         width: width of the recurrent state that mixes the matrices.
         hidden: widths of the encoder; the decoder has them in reverse order.
         learn_noise: whether to learn diagonal Q and R; otherwise they are .08 I and .03 I.
-        phases: train in the paper's three phases: first encoder and decoder alone, after a tenth of the run also the
-            matrices, after a third also the network that mixes them. (On simulated people, 1500 steps, three seeds, the
-            validation bound is .9 nats a frame higher than when training all parts at once, standard error .25.)
+        phases: whether to train in the paper's three phases: first encoder and decoder alone, after a tenth of the run
+            also the matrices, after a third also the network that mixes them. (On simulated people, 1500 steps, three
+            seeds, the validation bound is .9 nats a frame higher than when training all parts at once, standard error
+            .25.)
     """
 
     name = "kvae"
@@ -148,7 +149,8 @@ class KalmanVAE(DynamicalVAE):
 class Encoding(Rollout):
     """A rollout of the guide that draws a_t from p(a_t | all other a) where the frame is not encoded.
 
-    With gradients enabled it does not: a bound ignores these frames, and drawing them would double its run time.
+    With gradients enabled, it does not draw them: a bound ignores these frames, and the draws would double its run
+    time.
 
     Args:
         network: network of p(a).
@@ -283,17 +285,27 @@ class KalmanNetwork(Network):
 
     @torch.no_grad()
     def completed(self, a: Tensor, present: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Return a (B, T, D), with draws of p(a_t | all present a) at frames where `present` (B, T) is False."""
+        """Return a (B, T, D) with draws of p(a_t | all present a) at frames that are not encoded.
+
+        Args:
+            a: encoded frames (B, T, D).
+            present: (B, T), False at frames that are not encoded.
+            lengths: (B,) valid steps of a ragged batch.
+        """
         valid = None if lengths is None else valid_steps(lengths, a.shape[1]).t()
         chain, _, alpha = self.chain_of(a.transpose(0, 1), present.t(), valid)
         draws = self.emitted(chain.draw(torch.randn_like(chain.potential)), alpha).transpose(0, 1)
         return torch.where(present[..., None], a, draws.to(a.dtype))
 
     def emitted(self, z: Tensor, alpha: Tensor) -> Tensor:
-        """Return draws of a (T, B, D) given z_{1:T} (T, B, N), for missing frames.
+        """Return draws of a (T, B, D) given z_{1:T}, for missing frames.
 
         a_t is C_t z_t + N(0, R) and enters the mean of z_{t+1}. Matheron's rule corrects the unconditional draw by the
         residual of z_{t+1}.
+
+        Args:
+            z: (T, B, N).
+            alpha: weights of the matrices, (T, B, K).
         """
         transition, control, emission = self.mixed(alpha)
         noise, emission_noise = self.log_noise.exp(), self.log_emission.exp()
@@ -326,12 +338,25 @@ class KalmanNetwork(Network):
         return a, b, c
 
     def seen(self, emission: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the information G (..., N, N) and the potential g (..., N) about z in a (..., D)."""
+        """Return the information about z in a: a Gaussian likelihood exp(g'z - z'Gz / 2) as G and g.
+
+        Args:
+            emission: C, (..., D, N).
+            a: (..., D).
+
+        Returns:
+            Information matrix G (..., N, N) and potential g (..., N).
+        """
         weighted = (emission * torch.exp(-self.log_emission)[:, None]).mT
         return weighted @ emission, (weighted @ a[..., None].double())[..., 0]
 
     def parts_of(self, mean: Tensor, covariance: Tensor, emission: Tensor) -> tuple[Tensor, Tensor]:
-        """Return location (..., D) and whitening matrix (..., D * D) of a_t from the moments of z_t."""
+        """Return location (..., D) and flat whitening matrix (..., D * D) of a_t.
+
+        Args:
+            mean, covariance: moments of z_t, (..., N) and (..., N, N).
+            emission: C_t, (..., D, N).
+        """
         loc = (emission @ mean[..., None])[..., 0]
         spread = emission @ covariance @ emission.mT + self.log_emission.exp().diag()
         return loc, InverseCholesky.apply(spread).flatten(-2)
@@ -350,7 +375,13 @@ class KalmanNetwork(Network):
         return features.to(self.A.dtype), state
 
     def ahead(self, state: Predicted, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Predicted:
-        """Return the prediction of step t from the prediction of step t-1 and from a_{t-1}."""
+        """Return the prediction of step t from the prediction of step t-1 and from a_{t-1}.
+
+        Args:
+            state: prediction of step t-1.
+            t: index of the step, from 0.
+            drawn: values (B, D) by step of the variables that a loop draws, by name; read if `state` has no given a.
+        """
         mean, covariance, emission = state.mean, state.covariance, state.emission
         values = drawn[self.inputs[0].name] if state.known is None else state.known
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)
@@ -378,8 +409,8 @@ class Predicted:
     """The state of a `KalmanNetwork`: the given a, and the distribution of z_t given a_{<t}.
 
     Args:
-        known: a by step; None if the loop draws it.
-        present: (B,) by step, whether a is present; None if it always is.
+        known: given a, one value per step; None if the loop over steps draws a.
+        present: whether a is present, (B,) for each step; None if it is present at all steps.
         hidden: hidden state of the LSTM.
         mean, covariance: moments of z_t.
         emission: C_t; None before the first step.
@@ -430,7 +461,7 @@ def smooth(model: DynamicalVAE, batch: AnyBatch, samples: int = 1) -> SmoothedLa
     if not isinstance(network, KalmanNetwork):
         raise ValueError(f"smoothing needs the chain of a kvae model, but this model is {model.generative.text}")
     if samples < 1:
-        raise ValueError(f"samples is at least 1, got {samples}")
+        raise ValueError(f"`samples` must be at least 1, got {samples}")
     data = {name: repeat(value, samples) for name, value in model.read(batch).items()}
     run = model.rollout(data, guide=True)
     present, valid = run.present.get("a"), None if run.lengths is None else valid_steps(run.lengths, run.length).t()

@@ -53,7 +53,7 @@ class SRNN(LatentMethod):
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
-        """Return the model, whose three factors share h_t; a guide that reads indicators has its own state."""
+        """Return the model, whose factors share h_t; a guide that reads indicators of missing data has its own."""
         model = super().build(data)
         sides = model.generator["x"], *(() if model.indicators else (model.encoder["z"],))
         tie(model.generator["z"].network, *(conditional.network for conditional in sides))

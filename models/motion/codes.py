@@ -67,7 +67,11 @@ def codes(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
 
 
 def code_diversity(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
-    """Return the mean distance between two of K `codes` of each observation, (B,).
+    """Return the mean distance (B,) between two of K `codes` of each observation, in the unit of the code.
+
+    Args:
+        model, batch: as in `codes`.
+        samples: K, number of codes.
 
     Raises:
         ValueError: if `samples` is less than 2.

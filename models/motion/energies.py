@@ -81,7 +81,11 @@ class EnergyMethod(PoseMethod):
     heading: bool | None = None
 
     def start(self, model: EnergyModel, windows: Windows) -> None:
-        """Set the limits of the angles and the pose prior of a model.
+        """Estimate the angle limits of a model, and load or fit its pose prior.
+
+        Args:
+            model: model of this method, changed in place.
+            windows: training windows.
 
         Raises:
             ValueError: if the pose prior has another skeleton.
@@ -97,7 +101,7 @@ class EnergyMethod(PoseMethod):
             model.pose_prior.load_state_dict(prior.state_dict())
 
     def scored(self, windows: Windows) -> Source:
-        """Return windows with pseudo ground truths if these have a weight; all options must be resolved."""
+        """Return windows with pseudo ground truths if their weight is not 0; all options must be resolved."""
         method: Any = self
         if not method.multimodal:
             return windows
@@ -138,7 +142,7 @@ class EnergyModel(DynamicalVAE):
         self.pose_prior = PosePriorModel(skeleton).requires_grad_(False) if method.pose_prior else None
 
     def best(self, samples: Tensor, truth: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Return the energies of the best sample that have a weight, (B,) each.
+        """Return the energies of the best sample whose weight is not 0, (B,) each.
 
         Args:
             samples: positions (S, B, T, D) of the frames to score, rotated as the networks see them.
@@ -156,7 +160,7 @@ class EnergyModel(DynamicalVAE):
         return terms
 
     def realism(self, samples: Tensor, truth: Tensor, frames: Tensor) -> dict[str, Tensor]:
-        """Return the energies of limb lengths, angles and pose prior that have a weight, (B,) each.
+        """Return the energies of limb lengths, angles and pose prior whose weight is not 0, (B,) each.
 
         Args:
             samples: (S, B, T, D), whose limb lengths are scored in all frames.
@@ -182,7 +186,12 @@ class EnergyModel(DynamicalVAE):
         return x if self.heading is None else self.heading.face(x)
 
     def positions(self, values: Mapping[str, Tensor], data: Batch) -> Batch:
-        """Return rotated positions (..., B, T, D) from x or all its parts as the networks see them."""
+        """Return positions (..., B, T, D), rotated as the networks see them.
+
+        Args:
+            values: x, or all parts of x by name, in the representation of the model.
+            data: batch as returned by `read`, with the bone lengths if the model reads directions of bones.
+        """
         lengths = {LENGTHS: data[LENGTHS]} if self.bones else {}
         return self.view.inverse(Batch(values) | lengths)
 

@@ -51,8 +51,8 @@ class FutureMethod(PoseMethod):
 
     Args:
         latent: size of the latent.
-        beta: weight of the KL, relative to squared errors in square metres. By default the papers' for Human3.6M and
-            HumanEva, and the one of Human3.6M for other poses.
+        beta: weight of the KL, relative to squared errors in square metres. By default the papers' values for Human3.6M
+            and HumanEva, and the value for Human3.6M for other poses.
         join: weight of the squared distance between the last observed pose and the first predicted one.
         heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures
             back. By default off for Human3.6M and HumanEva, and on for other skeletons with known left and right.
@@ -75,7 +75,7 @@ class FutureMethod(PoseMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset, without headings if left and right of the skeleton are unknown."""
+        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
         preset = super().preset(skeleton)
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
@@ -88,7 +88,8 @@ class FutureMethod(PoseMethod):
     def build(self, data: Any) -> FutureModel:
         """Return the model for windows of poses relative to the pelvis.
 
-        From sizes alone, it is a model whose batches contain x and h, two frames of the size of x.
+        If `data` only gives sizes, the batches of the model contain x and two observed frames h, which have the size of
+        x.
 
         Raises:
             ValueError: if the poses have a root.
@@ -200,6 +201,10 @@ class FedBackNetwork(Network):
         """Return the inputs known at each step, the pose before the first (B, D), and the first state (B, W).
 
         The inputs are (B, T, known), or (B, 1, known) if they are the same at all steps.
+
+        Args:
+            parents: values of the parents by name.
+            length: T.
         """
         raise NotImplementedError
 

@@ -64,12 +64,14 @@ PRESETS = table(
         "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
     },
 )
-"""Options by skeleton: the paper's; for other skeletons, at 30 frames a second, 15 observed and 60 predicted frames."""
+"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
 
 
 @dataclass(frozen=True)
 class GSPS(EnergyMethod):
-    """Diverse futures, part by part. Defaults are the paper's for Human3.6M and HumanEva-I, and smaller for others.
+    """Diverse futures, part by part.
+
+    The defaults are the paper's sizes for Human3.6M and HumanEva-I, and smaller sizes for other skeletons.
 
     Options with one number for each part also accept one number for all parts.
 
@@ -121,7 +123,7 @@ class GSPS(EnergyMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        """Return the generative model and the guide; here half of the steps are observed."""
+        """Return the generative model and the guide of sequences whose first half is observed."""
         generative = part_by_part(self.names, lambda length: max(1, length // 2))
         return generative, generative.prior_guide(self.names)
 
@@ -136,9 +138,14 @@ class GSPS(EnergyMethod):
         return {name: self._spread(name, value) for name, value in super().preset(skeleton).items()}
 
     def _spread(self, name: str, value: Any) -> Any:
-        """Return the preset of two parts adapted to these parts.
+        """Return the preset value of an option for these parts, computed from the preset for two parts.
 
-        The number of futures does not increase, unless each part would have fewer than two draws.
+        The result has the mean of the preset for every part. For "draws", the number of futures does not exceed the
+        preset's, unless each part would have fewer than two draws.
+
+        Args:
+            name: name of the option.
+            value: preset for two parts, or a single value, which is returned unchanged.
         """
         count = len(self.parts)
         if not isinstance(value, tuple) or count == len(value):
@@ -226,7 +233,10 @@ class GSPSModel(EnergyModel):
         return super().guide(batch, **self._with_draws(batch, options))
 
     def _with_draws(self, batch: AnyBatch | None, options: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options, with several draws if the batch has whole windows, whose truth scores futures."""
+        """Return the options, with several draws if the batch has whole windows.
+
+        The energies compare these draws with the true future, which only whole windows contain.
+        """
         x = batch.get(WHOLE) if isinstance(batch, Mapping) else None
         is_complete = x is not None and x.shape[1] == self.length and options.get("length") is None
         return {**({"draws": self.draws} if is_complete else {}), **options}
@@ -242,10 +252,10 @@ class GSPSModel(EnergyModel):
         return self.energies(values, truth, data)
 
     def energies(self, values: Mapping[str, Tensor], truth: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Return the energies, if they have a weight, of futures that were drawn together, (B,) each.
+        """Return the energies of futures that were drawn together, (B,) each, except energies with weight 0.
 
         Args:
-            values: mapping from name to rows, draw by draw, of a rollout with `draws`.
+            values: mapping from variable to its values in a rollout with `draws`; rows are ordered draw by draw.
             truth: (B, T, D), NaN where it was not observed.
             batch: batch after `read`, with "pseudo" and "valid" if there are further futures.
         """
@@ -326,7 +336,7 @@ class GSPSModel(EnergyModel):
             return super().impute(batch, samples, **options)  # which raises
         if (length := batch[WHOLE].shape[1]) != self.length:
             raise ValueError(
-                f"{self.method.name} fills gaps in windows of {self.length} frames, not {length}; cut the motion into "
+                f"{self.method.name} imputes windows of {self.length} frames, got {length}; cut the motion into "
                 "such windows, as `dvae impute` does without --clip"
             )
         motions, count = [], prod(self.draws.values())
@@ -346,7 +356,12 @@ class GSPSModel(EnergyModel):
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:
-    """Return the generative model of parts in this order; `observed` returns O for T steps."""
+    """Return the generative factorization of parts, each of which reads the parts before it.
+
+    Args:
+        parts: names of the parts, in the order of their prediction.
+        observed: function from the number of steps T to the number of observed steps O.
+    """
     text = " ".join(
         f"p({code}) p({name}_t | h_{{1:O}}, {''.join(f'{before}_{{1:T}}, ' for before in parts[:i])}{code})"
         for i, (code, name) in enumerate(zip(_codes(parts), parts, strict=True))

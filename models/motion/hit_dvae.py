@@ -80,7 +80,7 @@ NETWORKS = table(
     {"humaneva": (8, 10, 256, 15, False), "human36m": (8, 10, 256, 20, False), "": (8, 6, 128, 10, True)},
 )
 PRESETS = {skeleton: options | NETWORKS[skeleton] for skeleton, options in ENERGIES.items()}
-"""Options by skeleton: the paper's; for other skeletons, at 30 frames a second, 15 observed and 60 predicted frames."""
+"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
 
 PARTS = ("lower", "upper")
 FRAMES = 15
@@ -173,7 +173,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         energy_options = (*EnergyMethod.weights, "kl_local", "kl_static", "samples", "pose_prior_run", "bones")
         if self.loss == "evidence" and (unsupported := [name for name in energy_options if getattr(self, name)]):
             raise ValueError(
-                f"loss='evidence' has no {', '.join(unsupported)}; use loss='best-of-many' or leave them out"
+                f"loss='evidence' does not use {', '.join(unsupported)}; leave them out, or use loss='best-of-many'"
             )
         for name in ("diversity", "diversity_scale"):
             values = getattr(self, name)
@@ -282,7 +282,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def start(self, model: Any, windows: Any) -> None:
-        """Prepare a model, fit the units of the poses, and start a learned scale of x at these units."""
+        """Prepare a model: fit the units of the poses, and initialise a learned scale of x at these units."""
         start_priors(model, windows)
         if isinstance(model, EnergyModel):
             super().start(model, windows)
@@ -302,7 +302,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             return super().objective()
         if self.diversity is None or self.kl_local is None or self.kl_static is None or self.samples is None:
             raise ValueError(
-                "the weights depend on the skeleton; call method.resolve_defaults(windows) first, or use "
+                "the weights of the loss depend on the skeleton; call method.resolve_defaults(windows) first, or use "
                 "loss='evidence' for data that are not poses"
             )
         weights = {"z": self.kl_local, **({"w": self.kl_static} if self.static else {})}

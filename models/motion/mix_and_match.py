@@ -63,7 +63,7 @@ EQUATIONS = {
     "add": ("p(z) p(x_t | x_{<t}, h, z)", "q(z)"),
     "step": ("p(z_t) p(x_t | x_{<t}, h, z_t)", "q(z_t | x_{<=t}, h)"),
 }
-"""Equations of the other ways to add the noise, by option."""
+"""Equations of the ways to add noise other than "mix", by value of the option `noise`."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class MixAndMatchMotion(PoseMethod):
         width: L, units of recurrent networks and of the code; by default 1024 for Human3.6M's skeleton, as in the
             paper, and 128 for others.
         latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 otherwise.
-        scale: standard deviation of the quaternions' numbers, which sets the relative weight of the KL.
+        scale: standard deviation of each coordinate of the quaternions, which sets the relative weight of the KL.
         skeleton: weight of the squared error of positions without the root's rotation, relative to the error of
-            quaternions; both are means over their numbers.
+            quaternions; both are means over coordinates.
         velocity: whether to predict the difference from the previous pose instead of the pose.
         curriculum: share of training over which the drawn indices change from the first ones to random ones; 0 for
             random indices from the start.
@@ -149,7 +149,8 @@ class MixAndMatchMotion(PoseMethod):
     def build(self, data: Any) -> DynamicalVAE:
         """Return the model for windows of quaternions.
 
-        From sizes alone, it is a model whose batches contain x and h, two frames of the size of x.
+        If `data` only gives sizes, the batches of the model contain x and two observed frames h, which have the size of
+        x.
 
         Raises:
             SchemaError: if the windows have another representation.
@@ -213,7 +214,13 @@ class MixAndMatchModel(DynamicalVAE):
 
 
 def _unrotated_positions(quaternions: Tensor, lengths: Tensor, view: Rotations) -> Tensor:
-    """Return positions (B, T, 3 J') of poses (B, T, D), with the root at the origin and without rotation."""
+    """Return positions (B, T, 3 J') of poses, with the root at the origin and without the root's rotation.
+
+    Args:
+        quaternions: poses (B, T, D), quaternions of the joints after the root's position, if there is one.
+        lengths: bone lengths of the bodies, as in batches.
+        view: conversion between quaternions and positions.
+    """
     root, start = view.turning.index(view.skeleton.root), 3 * view.root
     identity = constant((1.0, 0.0, 0.0, 0.0), quaternions).expand(*quaternions.shape[:-1], 4)
     first = torch.zeros_like(quaternions[..., :start])
@@ -237,7 +244,7 @@ class FutureEncoder:
     noise: Noise | None
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> Network:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureFilter(self.width).build(inputs, local, size) if local else FutureEncoderNetwork(self, inputs)
 
 
@@ -274,7 +281,7 @@ class FutureDecoder:
     velocity: bool
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FutureDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return FutureDecoderNetwork(self, inputs, size)
 
 

@@ -46,9 +46,9 @@ from .futures import HISTORY, FutureMethod, FutureModel, LastState
 
 MODE, NOISE = "k", "e"
 WHOLE_SETS = "sets"
-"""Key of batches that contain every window in all modes, mode by mode, for energies to compare; its value is True."""
+"""Key of batches, with value True, that contain every window in all modes, mode by mode; energies compare the modes."""
 OF_CVAE = ("latent", "width", "hidden", "heading")
-"""Options of the CVAE."""
+"""Options of `ModesMethod` that are options of the CVAE."""
 SHAPE = (CVAE.latent, CVAE.width, CVAE.hidden)
 """Sizes of the CVAE if there is no run."""
 
@@ -118,7 +118,13 @@ class ModesMethod(FutureMethod):
         return Recipe(train, validation, [Stage(steps, method.objective())], 1.0, prepare)
 
     def start(self, model: ModesModel, train: Any, validation: Any, steps: int) -> None:
-        """Load the weights of the CVAE's decoder into a model.
+        """Load the weights of the decoder from a run of a CVAE into a model, or fit a CVAE first if there is no run.
+
+        Args:
+            model: model of this method.
+            train: training windows.
+            validation: validation windows, or None.
+            steps: number of steps to fit a CVAE.
 
         Raises:
             ValueError: if the run is not of a cvae, or has other windows or options.
@@ -215,7 +221,7 @@ class ModesModel(FutureModel):
         return Batch(repeat(data, len(modes))) | {MODE: codes, "group": group}
 
     def _one_hot(self, modes: Tensor, like: Tensor) -> Tensor:
-        """Return the one-hot codes (B, K) of the modes of each row."""
+        """Return one-hot codes (B, K) of modes (B,), with the type and device of `like`."""
         return torch.eye(self.modes, dtype=like.dtype, device=like.device).index_select(0, modes.to(like.device))
 
     def in_sets(self, batch: AnyBatch | None) -> Batch:
@@ -296,7 +302,15 @@ class ModesModel(FutureModel):
         samples: int,
         chunk: int,
     ) -> dict[str, Tensor]:
-        """Return samples (S, B, ...) of all windows; `make` returns n draws (n, M b, ...) of b windows in M modes."""
+        """Return samples (S, B, ...) of all windows in all modes, computed in chunks of windows.
+
+        Args:
+            make: function of a slice of b windows, M modes and a number of draws n, which returns values (n, M b, ...)
+                by name.
+            data: data of the B windows.
+            samples: S. If it is not a multiple of the number of modes, the last samples are of random modes.
+            chunk: largest number of windows times modes at once.
+        """
         size, step = len(data[HISTORY]), max(chunk // self.modes, 1)
         n_full, n_rest = divmod(samples, self.modes)
         sets = [(torch.arange(self.modes), n_full)] if n_full or not n_rest else []
@@ -334,7 +348,7 @@ class ModesDecoder:
     sampler_hidden: tuple[int, ...]
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> ModesDecoderNetwork:
-        """Return the network of a factor with these parents."""
+        """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
         return ModesDecoderNetwork(self, inputs, size)
 
 

@@ -21,7 +21,7 @@ no detail:
 * GradNorm makes these gradients equal (asymmetry 0), because log-likelihoods have no zero as a reference for their
   decrease.
 
-The learning rate of the second phase and its share of the steps suit short runs (docs/decisions.md); the paper has 1e-4
+The learning rate of the second phase and its share of the steps suit short runs (benchmarks/results/motion_latent_4d); the paper has 1e-4
 and 200 of 5200 epochs.
 """
 
@@ -103,7 +103,7 @@ class MotionLatent(Method):
     def build(self, data: Any) -> DynamicalVAE:
         """Return the model for segments (`dvae.motion.Segments`).
 
-        From a schema with only the sizes of its variables and a length, it is a model without a surface.
+        If the schema has only the sizes of its variables and a length, the model has no surface.
         """
         schema = Schema.of(data)
         sizes, length = {name: schema.size(name) for name in (*PARTS, SHAPE)}, schema.length or 100
@@ -169,17 +169,25 @@ class MotionLatentModel(DynamicalVAE):
         return self.posterior(batch).mean  # type: ignore[no-any-return]
 
     def decode(self, latent: Tensor, shape: Tensor, frames: Tensor | None = None) -> Tensor:
-        """Return frames x (..., N, D), the means of chi, for latents (..., Z) on bodies (..., S), with gradients.
+        """Return decoded frames x (..., N, D), which are the means of chi, with gradients.
 
-        With `frames` (K,), only these frames are computed, (..., K, D).
+        Args:
+            latent: z, (..., Z).
+            shape: beta, shape parameters of the bodies, (..., S).
+            frames: (K,), indices of the frames to compute; the result is then (..., K, D). Default: all.
         """
         return self.decoder(latent, shape)(frames)
 
     def decoder(self, latent: Tensor, shape: Tensor) -> Callable[..., Tensor]:
-        """Return a decoder of latents (..., Z) on bodies (..., S); the part that all frames share is computed once.
+        """Return a function that decodes some frames; the computation that all frames share runs only once.
+
+        Args:
+            latent: z, (..., Z).
+            shape: beta, shape parameters of the bodies, (..., S).
 
         Returns:
-            A function of frames (K,), or None for all, and a slice of coordinates, by default all; see `decode`.
+            Function of frame indices (K,), None for all, and optionally a slice of the coordinates. It returns frames
+            as `decode` does.
         """
         network = self.generator[ROTATIONS].network
         parents = {"z": latent.flatten(0, -2), SHAPE: shape.flatten(0, -2)}
@@ -193,12 +201,17 @@ class MotionLatentModel(DynamicalVAE):
         return decode_frames
 
     def vertices(self, x: Tensor, shape: Tensor) -> Tensor:
-        """Return surfaces (..., N, V, 3), in metres, of frames (..., N, D) on bodies (..., S), with gradients."""
+        """Return surfaces (..., N, V, 3) in metres, with gradients.
+
+        Args:
+            x: frames (..., N, D).
+            shape: beta, shape parameters of the bodies, (..., S).
+        """
         return surfaces_of(self.timed, self.body, x, shape)
 
     @override
     def penalties(self, rollout: Rollout, data: Mapping[str, Any], draws: Mapping[str, int]) -> dict[str, Tensor]:
-        """Return the squared error of the surface, mean over vertices, in deviations, if the objective has draws."""
+        """Return the squared error of the surface, mean over vertices, / (2 deviation^2); empty without `draws`."""
         if not draws or not set(PARTS) <= data.keys():
             return {}
         predicted = self._unpack({name: rollout.parameters(name, rollout.values[name])[0] for name in PARTS})

@@ -17,7 +17,12 @@ from ..method import Method
 
 
 def table(options: str, rows: Mapping[str, Sequence[Any]]) -> dict[str, dict[str, Any]]:
-    """Return presets by skeleton from rows of values and the names of their options."""
+    """Return the presets of each skeleton as dictionaries from option to value.
+
+    Args:
+        options: names of the options, separated by spaces.
+        rows: dictionary from skeleton to the values of these options, in the same order.
+    """
     return {skeleton: dict(zip(options.split(), values, strict=True)) for skeleton, values in rows.items()}
 
 
@@ -69,7 +74,7 @@ class PoseMethod(Method):
         if schema.protocol.root != "drop":
             raise ValueError(
                 f"{self.name} predicts poses relative to the pelvis, but the protocol {schema.protocol.name} has "
-                f"root={schema.protocol.root!r}; use one with root='drop'"
+                f"root={schema.protocol.root!r}; use a protocol with root='drop'"
             )
         return schema
 

@@ -1,6 +1,6 @@
 """Base of the methods that complete a motion from one pose and given paths of some joints.
 
-    s the first pose, y_{1:T} the given trajectories, r_{1:T} the other joints', x_{1:T} the motion
+    s the first pose, y_{1:T} the given trajectories, r_{1:T} those of the other joints, x_{1:T} the motion
 
 Poses are positions in metres relative to the first pelvis, so that the body moves through space. y and r are copies of
 x with zeros at all other joints. In training, every joint of a window is given with probability `keep`, over all its
@@ -54,8 +54,9 @@ class TrajectoryMethod(PoseMethod):
         keep: probability that a joint is given, in training.
         rotate: whether to rotate every training window about the up axis by a uniform angle.
         heading: whether to rotate every window so that its first pose faces one way, and rotate the motion back. The
-            model is then exactly equivariant, and `rotate` has no effect. By default off for Human3.6M, as in the
-            paper, which leaves it to learning, and on for other skeletons with known left and right.
+            model is then exactly equivariant to rotations, and `rotate` has no effect. By default off for Human3.6M, as
+            in the paper, where the network learns this from rotated windows, and on for other skeletons with known left
+            and right.
     """
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {HUMAN36M.name: {"heading": False}, "": {"heading": True}}
@@ -67,7 +68,7 @@ class TrajectoryMethod(PoseMethod):
 
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset, without headings if left and right of the skeleton are unknown."""
+        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
         preset = super().preset(skeleton)
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
@@ -83,7 +84,8 @@ class TrajectoryMethod(PoseMethod):
     def build(self, data: Any) -> DynamicalVAE:
         """Return the model for windows with a root and one observed frame.
 
-        From sizes alone, it has the paper's options, and its batches contain x and y, r and s of the size of x.
+        If `data` only gives sizes, the model has the paper's options, and its batches contain x, y, r and s, which all
+        have the size of x.
 
         Raises:
             ValueError: if windows have no root or more than one observed frame, or the size of x is missing.
@@ -96,8 +98,8 @@ class TrajectoryMethod(PoseMethod):
             suitable = (name for name, other in PROTOCOLS.items() if (other.root, other.observed) == REQUIRED_PROTOCOL)
             raise ValueError(
                 f"{self.name} moves a body through space from one pose, but the protocol {protocol.name} has "
-                f"root={protocol.root!r} and {protocol.observed} observed frames; use one with root='relative' and "
-                f"observed=1, such as {', '.join(suitable)}"
+                f"root={protocol.root!r} and {protocol.observed} observed frames; use a protocol with root='relative' "
+                f"and observed=1, such as {', '.join(suitable)}"
             )
         return self.build_on(schema.skeleton, schema.frames - 1)
 
@@ -127,7 +129,7 @@ class LatentTrajectoryMethod(TrajectoryMethod):
 
     Args:
         beta: weight of the KL, relative to squared errors in square metres.
-        complement: whether the guide reads only the joints that are not given.
+        complement: whether the guide reads only the joints that are not given; otherwise it reads all joints.
     """
 
     trainings: ClassVar[Mapping[str, Training]] = {
@@ -151,9 +153,9 @@ class LatentTrajectoryMethod(TrajectoryMethod):
 
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
-        """Return one stage that minimises squared errors and the weighted KL, on the same windows.
+        """Return one stage that minimises squared errors and the weighted KL, with windows as in `TrajectoryMethod`.
 
-        The best weights have the lowest loss, because the bound does not include beta, which is part of the model.
+        The best weights are chosen by the loss, not by the bound, because the bound does not include beta.
         """
         method: Any = self.resolve_defaults(train)
         stages = [Stage(steps, Evidence(kl_weight=method.beta, select="loss"))]
@@ -161,7 +163,7 @@ class LatentTrajectoryMethod(TrajectoryMethod):
 
 
 class Paths(View):
-    """A view that adds given trajectories to the motion; a batch without trajectories gives none."""
+    """A view that adds given trajectories to the motion; if a batch has none, no joint is given."""
 
     @override
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
@@ -212,7 +214,7 @@ class TrajectoryModel(DynamicalVAE):
 
     @override
     def model(self, batch: AnyBatch | None = None, *, curriculum: float = 1.0, **options: Any) -> dict[str, Tensor]:
-        """Run the generative program; a batch without trajectories gives none.
+        """Run the generative program; if a batch has no trajectories, no joint is given.
 
         Raises:
             ValueError: if the batch has no initial pose.
@@ -262,7 +264,7 @@ class TrajectoryModel(DynamicalVAE):
         if fix:
             raise ValueError(f"cannot fix {', '.join(fix)}; give known parts of a motion as trajectories, in y")
         if horizon < 1 or samples < 1:
-            raise ValueError(f"horizon and samples are at least 1, got {horizon} and {samples}")
+            raise ValueError(f"`horizon` and `samples` must be at least 1, got {horizon} and {samples}")
         if not 0 <= temperature < inf:
             raise ValueError(f"temperature is {temperature}; it must be finite and at least 0")
         data = self.read(batch)
@@ -272,7 +274,7 @@ class TrajectoryModel(DynamicalVAE):
         if self.frames is not None and horizon > self.frames:
             warnings.warn(
                 f"this model was fitted to motions of {self.frames} frames, and may predict {horizon} frames badly; "
-                "reduce the horizon, or fit the model under a protocol that predicts as many",
+                f"reduce the horizon, or fit the model under a protocol with a horizon of {horizon} frames",
                 stacklevel=3,  # torch.no_grad is between
             )
         length = data[GIVEN].shape[1]
@@ -299,6 +301,10 @@ class TrajectoryModel(DynamicalVAE):
     def _extend_paths(self, data: Batch, horizon: int) -> Batch:
         """Return the data with trajectories over all frames that the networks predict for a horizon.
 
+        Args:
+            data: batch as returned by `read`, with the first pose (B, D).
+            horizon: H, number of frames that are requested.
+
         Raises:
             ValueError: if trajectories end before the horizon or do not have the size of the poses.
         """
@@ -313,7 +319,8 @@ class TrajectoryModel(DynamicalVAE):
             raise ValueError(f"the trajectories have {trajectories.shape[1]} frames, but the horizon is {horizon}")
         if not trajectories.isfinite().all():
             raise ValueError(
-                "trajectories must be finite, and 0 at joints that are not given; `complete` accepts paths with gaps"
+                "trajectories must be finite, and 0 at joints that are not given; `complete` accepts paths "
+                "with missing frames"
             )
         length = max(horizon, self.frames or horizon)
         tail = trajectories[:, -1:].expand(-1, max(length - trajectories.shape[1], 0), -1)
@@ -340,8 +347,8 @@ class TrajectoryModel(DynamicalVAE):
         Args:
             initial_pose: positions (J, 3) of all joints, in metres, in world coordinates.
             trajectories: mapping from joint to path (T, 3), in metres, in the same coordinates. The first frame follows
-                the pose; a frame with a NaN is missing. A joint has its name in the skeleton, or one such as
-                "left_wrist".
+                the pose; a frame with a NaN is missing. Joints are named as in the skeleton, or by a common name such
+                as "left_wrist".
             frames: T, number of frames; required without trajectories.
             samples: S, number of motions.
             exact: whether to put the given joints exactly on their paths, with the most likely change of the latents
@@ -366,7 +373,7 @@ class TrajectoryModel(DynamicalVAE):
         ]:
             raise ValueError(
                 f"the initial pose has no positions of {', '.join(missing)}, but must be complete; choose another "
-                "window, or fill the gaps first (`dvae impute RUN --filled FILE`)"
+                "window, or fill them in first (`dvae impute RUN --filled FILE`)"
             )
         if problem := defect(Clip("initial", "pose", pose[None].numpy()), self.skeleton):
             raise ValueError(problem.replace("clip initial/pose", "the initial pose"))
@@ -379,7 +386,7 @@ class TrajectoryModel(DynamicalVAE):
             lengths["frames"] = frames
         if len(set(lengths.values())) != 1 or min(lengths.values()) < 1:
             lengths_text = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
-            raise ValueError(f"expected paths of one length, or frames= without any; got {lengths_text}")
+            raise ValueError(f"expected paths of equal length, or `frames` if there are no paths; got {lengths_text}")
         if exact and not paths:
             raise ValueError("exact=True makes motions follow paths, but got no path; give trajectories")
         if exact and not self.latents:
@@ -396,8 +403,8 @@ class TrajectoryModel(DynamicalVAE):
             known_mask[:, joint] = is_known[:, None].double()
             if not targets[:, joint].any():
                 warnings.warn(
-                    f"the path of {self.skeleton.names[joint]} stays at the root of the first pose, and networks "
-                    "read it as no path; exact=True keeps the joint there",
+                    f"the path of {self.skeleton.names[joint]} stays at the root of the first pose, where its input "
+                    "is 0, so networks treat it as a joint without a path; exact=True keeps the joint there",
                     stacklevel=2,
                 )
         first = (pose - world).flatten()[None]
@@ -435,18 +442,25 @@ class TrajectoryModel(DynamicalVAE):
         worst = int(leaps.argmax())
         if leaps[worst] > LEAP:
             message = (
-                f"the path of {joint} moves by {leaps[worst]:.4g} m a frame before its frame {frames[worst + 1]} "
-                f"(since {'the pose' if worst == 0 else f'frame {frames[worst]}'})"
+                f"the path of {joint} moves by {leaps[worst]:.4g} m per frame from "
+                f"{'the pose' if worst == 0 else f'its frame {frames[worst]}'} to its frame {frames[worst + 1]}"
             )
             if leaps[worst] > FAR:
-                raise ValueError(f"{message}; paths are in metres, in the same world as the pose")
+                raise ValueError(f"{message}; paths must be in metres, in the same coordinates as the pose")
             warnings.warn(message, stacklevel=3)
         return path
 
     def _follow(
         self, batch: Mapping[str, Tensor], latents: Tensor, known_mask: Tensor, **options: Any
     ) -> tuple[Tensor, Tensor]:
-        """Return motions (S, T, D) that are on the given paths at known frames, and their corrections."""
+        """Return motions (S, T, D) that are on the given paths at known frames, and their corrections (S, T, D).
+
+        Args:
+            batch: first pose and trajectories, with one row.
+            latents: initial values of the latents of S motions.
+            known_mask: (T, D), 1 where a coordinate is given, otherwise 0.
+            **options: options of `dvae.motion.control.follow_paths`.
+        """
         data = self._extend_paths(self.read(batch), len(known_mask))
         known_mask = torch.cat(
             [known_mask, known_mask.new_zeros(data[GIVEN].shape[1] - len(known_mask), known_mask.shape[1])]

@@ -2,8 +2,8 @@
 
     p(z_k | y_{1:T}, s) p(x_t | z_{1:T}, s)        q(z_k | r_{1:T}, s)
 
-k counts coefficients of the cosine transform, and t counts frames. z has as many coefficients as x has frames, so that
-both are steps here. The prior is learned: a transformer of the given trajectories y and the first pose s. The guide
+k counts coefficients of the cosine transform, and t counts frames. z has as many coefficients as x has frames, so both
+are written as steps. The prior is learned: a transformer of the given trajectories y and the first pose s. The guide
 reads the remaining joints, r. The mean of x is s plus the cumulative sum of offsets over time. The loss is
 
     sum_t |x_t - mean_t|^2 + .01 KL(q | p)
@@ -43,7 +43,7 @@ PRESETS = table(
     "latent beta components width feedforward layers dropout heading",
     {"human36m": (512, 0.01, 0, 256, 512, 2, 0.1, False), "": (32, 0.001, 15, 32, 128, 1, 0.0, True)},
 )
-"""Options by skeleton: the paper's; for other skeletons, options that train in minutes on a CPU."""
+"""Options by skeleton: the paper's values; for other skeletons, values that train in minutes on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ class TrajeVAE(LatentTrajectoryMethod):
         heads_count: number of attention heads.
         layers: layers of each transformer.
         dropout: share of units dropped in training.
-        learned_prior: whether to learn the prior; otherwise p(z) = N(0, I), and the decoder reads y.
+        learned_prior: whether to learn the prior p(z_t | y_{1:T}, s); otherwise p(z) = N(0, I), and the decoder reads
+            the trajectories y.
         cosine: whether to use the cosine transform; otherwise z has one value for each frame.
     """
 
@@ -83,7 +84,7 @@ class TrajeVAE(LatentTrajectoryMethod):
         if self.width is not None and 2 * self.width % self.heads_count:
             raise ValueError(
                 f"heads_count={self.heads_count} does not divide the transformers' {2 * self.width} features; choose "
-                "a width whose double it divides"
+                "`width` so that 2 * width is a multiple of heads_count"
             )
         if self.components and not self.cosine:
             raise ValueError(

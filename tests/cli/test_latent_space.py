@@ -164,7 +164,7 @@ def test_observations_in_a_file_need_no_training_data(capsys, folder, loaded_run
         (lambda arrays: {**arrays, "markers": arrays["markers"][:, :, :5]}, r"expected \(2, \d+, 16, 3\)"),
         (
             lambda arrays: {**arrays, "markers": np.nan * arrays["markers"]},
-            "segment 0 of 2, counted from 0, has no observations.*leave it",
+            "segment 0 of 2, counted from 0, has only NaN instead of observations.*remove it",
         ),
         (
             lambda arrays: {**arrays, "markers": 1000 * arrays["markers"]},
@@ -179,7 +179,7 @@ def test_observations_in_a_file_need_no_training_data(capsys, folder, loaded_run
             lambda arrays: {**arrays, "times": np.zeros((2, 1001)), "markers": np.zeros((2, 1001, 16, 3))},
             "at most 1000",
         ),
-        (lambda arrays: {**arrays, "points": np.zeros((2, 1, 2**17 + 1, 3))}, "at most 131,072 of a segment"),
+        (lambda arrays: {**arrays, "points": np.zeros((2, 1, 2**17 + 1, 3))}, "at most 131,072 points per segment"),
     ],
 )
 def test_files_of_impossible_observations_are_errors(loaded_run, tmp_path, change, message):
@@ -234,7 +234,7 @@ def test_wrong_arguments_exit_with_2(capsys, folder, fitted, tmp_path, monkeypat
     ("keys", "value", "message"),
     [
         (("data", "cut"), "steps", "unknown cut 'steps'"),
-        (("data", "kind"), "motion", "have a schema of the kind 'poses', got 'segments'"),
+        (("data", "kind"), "motion", "require a schema of kind 'poses', got 'segments'"),
         (("schema", "timed", "frames"), 16384, "is larger than its weights"),
         (("schema", "timed", "skeleton", "names"), ["a"], "skeleton|names|parents"),
     ],

@@ -296,7 +296,7 @@ def test_options_for_another_kind_of_data_are_errors(people, table_runs, tmp_pat
     assert "--columns is for a table, and motion-latent is fitted on segments of motion" in segments
     for option in ("--observed", "--test"):
         error = failure(capsys, "fit", "vae", *out, option, "0", code=2)
-        assert f"{option} is for tables; name one with --data" in error
+        assert f"{option} is for tables; give the path of a table with --data" in error
     assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
         assert "is for motion" in failure(capsys, "evaluate", table_runs / "vae", *option, code=2)

@@ -173,7 +173,7 @@ def test_latents_whose_draws_have_no_gradient_are_an_error():
 @pytest.mark.parametrize("key", ["px", "qz"])
 def test_events_of_some_coordinates_are_an_error(key):
     x = torch.randn(2, 3, 2)
-    with pytest.raises(ValueError, match=r"event \(2,\); by its event_dim = 0 it has no event"):
+    with pytest.raises(ValueError, match=r"event shape \(2,\); its event_dim = 0 requires the event shape \(\)"):
         dvae.SequenceELBO().terms(model(**{key: Pairs}), x)
 
 

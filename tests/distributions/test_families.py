@@ -15,6 +15,8 @@ from dvae import distributions
 from dvae.distributions import Family, Shape
 from dvae.inference.training.svi import NonFiniteError
 from dvae.networks import Dense, Recurrent
+from dvae.program.model import DynamicalVAE
+from dvae.testing import FactorizationContract
 
 PAIR = "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_{1:T})"
 MIXED = distributions.Product((((1,), Family("Poisson")), ((0, 3), distributions.Normal()), ((2,), Family("Gamma"))))
@@ -195,7 +197,7 @@ def test_an_event_in_a_product_counts_once_and_cannot_be_partly_missing():
     data = model.sample(4, 5)
     mask = torch.ones_like(data["x"], dtype=torch.bool)
     mask[0, :, [0, 2]] = False
-    with pytest.raises(ValueError, match="together"):
+    with pytest.raises(ValueError, match="one joint density for 2 of them"):
         model.log_joint({"x": data["x"], "mask": mask.index_fill(2, torch.tensor([2]), True)}, {"z": data["z"]})
     complete = model.log_joint({"x": data["x"]}, {"z": data["z"]})["x"]
     masked = model.log_joint({"x": data["x"], "mask": mask}, {"z": data["z"]})["x"]
@@ -308,13 +310,17 @@ def test_a_custom_class_is_a_valid_family():
     assert built(Family(Twice)).generator["x"].head.label == "Twice"
 
 
-# ------------------------------------------------------------------------------ the custom family of docs/families.md
+# ------------------------------------------------------------ the custom family of docs/how-to/observations.md
 
-PAGE = (Path(__file__).parents[2] / "docs" / "families.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "observations.md").read_text(encoding="utf-8")
 NAMESPACE: dict = {}
-for block in re.findall(r"```python\n(.*?)```", PAGE.partition("## A family of one's own")[2], re.DOTALL):
-    exec(compile("import torch, dvae\npair = " + repr(PAIR) + "\n" + block, "families.md", "exec"), NAMESPACE)
+(example,) = re.findall(r"```python\n(.*?)```", PAGE.partition("## Your own distribution")[2], re.DOTALL)
+(definitions, _) = example.split("\nmodel = ")
+exec(compile("import torch, dvae\n" + definitions, "observations.md", "exec"), NAMESPACE)
 
 
-class TestCustomFamilyOfThePage(NAMESPACE["TestBursts"]):
-    """The family that docs/families.md defines."""
+class TestCustomFamilyOfThePage(FactorizationContract):
+    """The family that docs/how-to/observations.md defines."""
+
+    def build(self, size):
+        return DynamicalVAE(*PAIR, {"z": size, "x": size}, distributions={"p(x)": NAMESPACE["Bursts"]()})

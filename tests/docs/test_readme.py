@@ -1,57 +1,49 @@
-"""The README's section on tables: its commands run unchanged, on the file that it creates."""
+"""The README: its example has the scores that it prints, and its commands for a table run."""
 
 import re
 import shlex
-from pathlib import Path
 
+import numpy as np
 import pytest
 
+from benchmarks.studies.overview import DOCS, example
 from dvae.cli import main
 
-ROOT = Path(__file__).parents[2]
-SMALL = {
-    "sweep": "--steps 4 --seeds 0 1 --jobs 1 --batch-size 4 --validate-every 2",
-    "compare": "--particles 4 --contrasts 0",
-    "evaluate": "--samples 39",
-    "forecast": "--samples 4",
-}
+README = (DOCS.parent / "README.md").read_text(encoding="utf-8")
+SMALL = {"fit": "--steps 4 --batch-size 4 --validate-every 2", "evaluate": "--samples 39", "forecast": "--samples 4"}
+
+
+@pytest.mark.slow
+def test_the_example_beats_every_reference_and_is_calibrated():
+    scores = example()["scores"]
+    references = [name for name in scores.rows if name != "model"]
+    assert references == ["last value", "mean", "climatology", "nearest neighbours"]
+    for name in references:
+        difference = scores.difference("model", name, "CRPS")
+        assert difference.mean < -3 * difference.standard_error, name
+    coverage = scores["model"]["coverage 90 %"]
+    assert abs(coverage.mean - 0.9) < 2 * coverage.standard_error
+
+
+def test_the_readme_is_short():
+    assert README.count("\n") <= 120
 
 
 @pytest.mark.filterwarnings("ignore:.*it is shortened to:UserWarning")
-@pytest.mark.filterwarnings(
-    "ignore:columns left out of the proposed schema. 'iso_alpha' .neither numbers nor:UserWarning"
-)
-def test_the_commands_of_the_readme_on_tables_run(monkeypatch, tmp_path, capsys):
+def test_the_commands_for_a_table_run(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-    (section,) = re.findall(r"## Any table\n(.*?)\n## ", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    (script,) = re.findall(r'python -c "(.*)"', section)
-    exec(compile(script, "README.md", "exec"), {})
-    (command,) = re.findall(r"`dvae (data info .*)`", section)
-    assert main(shlex.split(command)) == 0
-    assert (tmp_path / "countries.toml").read_text(encoding="utf-8").startswith('id = ["country"]\ntime = "year"\n')
-    rows = [re.findall(r"[\w.+-]+", row) for row in re.findall(r"^    │.*", section, re.MULTILINE)]
-    printed_rows = [re.findall(r"[\w.+-]+", row) for row in capsys.readouterr().out.splitlines()]
-    assert rows
-    assert all(row in printed_rows for row in rows)
-
-    (schema,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
-    (tmp_path / "countries.toml").write_text(schema, encoding="utf-8")
-    commands = [shlex.split(line) for line in re.findall(r"^    dvae (.*)", section, re.MULTILINE)]
-    assert [name for name, *_ in commands] == ["sweep", "compare", "evaluate", "forecast"]
-    for name, *words in commands:
-        arguments = [str(path) for word in words for path in (sorted(tmp_path.glob(word)) if "*" in word else [word])]
-        assert main([name, *arguments, *shlex.split(SMALL[name])]) == 0, capsys.readouterr().err
-    output = capsys.readouterr().out
-    for text in (
-        "IWAE bound",
-        "climatology",
-        "CRPS, lifeExp ↓ (years)",
-        "CRPS, gdpPercap ↓ ($)",
-        "coverage 90 %",
-    ):
-        assert text in section
-        assert text in output
-    table = (tmp_path / "next.csv").read_text(encoding="utf-8").splitlines()
-    assert len(table) == 1 + 142 * 3 * 3
+    rng = np.random.default_rng(0)
+    rows = [
+        f"shop{shop},2024-{month:02}-01,{rng.poisson(20)},{rng.normal(15, 5):.1f}\n"
+        for shop in range(30)
+        for month in range(1, 13)
+    ]
+    (tmp_path / "sales.csv").write_text("".join(["shop,month,sold,temperature\n", *rows]), encoding="utf-8")
+    (section,) = re.findall(r"## A CSV in four commands\n(.*?)\n## ", README, re.DOTALL)
+    commands = [shlex.split(line, comments=True) for line in re.findall(r"^dvae (.*)", section, re.MULTILINE)]
+    assert [name for name, *_ in commands] == ["data", "fit", "evaluate", "forecast"]
+    for arguments in commands:
+        assert main([*arguments, *shlex.split(SMALL.get(arguments[0], ""))]) == 0, capsys.readouterr().err
+    assert "climatology" in capsys.readouterr().out
+    assert (tmp_path / "next.csv").read_text(encoding="utf-8").count("shop29") > 1
     assert (tmp_path / "next.png").read_bytes().startswith(b"\x89PNG")

@@ -135,7 +135,7 @@ def test_a_model_accepts_faithful_as_its_guide():
     [
         (lambda: faithful_inverse(DKF, order=[Block(("u",), 1)]), "latents"),
         (lambda: faithful_inverse(HIT_DVAE, order=[Block(("w", "z"), 1)]), "mixes static and local"),
-        (lambda: dvae.alternatives(DKF, steps=0), "steps must be at least 1"),
+        (lambda: dvae.alternatives(DKF, steps=0), "`steps` must be at least 1"),
         (
             lambda: faithful_inverse(
                 Factorization.parse("p(z_t | z_{own}) p(x_t | z_t)", {"own": Relation.parse("<t").mask})

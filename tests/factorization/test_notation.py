@@ -223,7 +223,10 @@ def test_blocks_draw_parents_before_children(pair, T):
             "p(z_t | x_{>=t}) reads x_{>=t}, but a generative model is drawn forward in time "
             "(cycle x_2 -> z_2 -> x_2); did you mean x_{<t}?",
         ),
-        ("p(x_t | x_t)", "p(x_t | x_t) reads x_t, but x_t is what it draws (cycle x_2 -> x_2); did you mean x_{t-1}?"),
+        (
+            "p(x_t | x_t)",
+            "p(x_t | x_t) reads x_t, but x_t is the variable that it draws (cycle x_2 -> x_2); did you mean x_{t-1}?",
+        ),
         ("q(z_t | z_{1:T})", "backward"),
         ("q(z_t | z_{t-1}, u_{t+1}) q(u_t | z_{t-2})", "reads"),
         ("p(w | x_{1:T}) p(x_t | w)", "p(w | x_{1:T}) reads x_{1:T}, but x is drawn from w (cycle x_2 -> w -> x_2)"),
@@ -246,8 +249,8 @@ def test_a_cyclic_factorization_is_an_error_that_names_the_cycle(text, message):
             "q(w)",
             ["x"],
             None,
-            "the latent z has no factor in the guide; add q(z_t | ...), or name z as observed; a discrete one is "
-            "summed out and needs none: sizes={'z': dvae.Discrete(states)}",
+            "the latent z has no factor in the guide; add q(z_t | ...), or name z as observed, or sum z out if it is "
+            "discrete: sizes={'z': dvae.Discrete(states)}",
         ),
         ("p(w) p(z_t)", ["x"], None, "expected p(...) for the generative model"),
         ("q(w) q(z)", ["x"], None, "z has one value per step in the generative model"),

@@ -249,19 +249,19 @@ def test_many_parameters_are_read_in_linear_time(isolated, tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("poses", np.zeros((3, 65)), r"poses \(3, 65\), trans \(3, 3\), expected"),
-        ("poses", np.zeros((2, 156)), r"poses \(2, 156\)"),
+        ("poses", np.zeros((3, 65)), r"poses have shape \(3, 65\) and trans \(3, 3\), expected"),
+        ("poses", np.zeros((2, 156)), r"poses have shape \(2, 156\)"),
         ("poses", np.zeros(3), "expected"),
-        ("poses", np.full((3, 66), np.nan), "poses holds float64, expected numbers, none NaN"),
-        ("poses", np.full((3, 66), "a"), "poses holds <U1"),
-        ("poses", np.full((3, 66), 1e30), "not a metre, radian or rate"),
+        ("poses", np.full((3, 66), np.nan), "poses has dtype float64, or NaN"),
+        ("poses", np.full((3, 66), "a"), "poses has dtype <U1"),
+        ("poses", np.full((3, 66), 1e30), "expected metres, radians or a rate"),
         ("trans", np.zeros((0, 3)), r"trans \(0, 3\)"),
-        ("trans", np.full((3, 3), np.inf), "trans holds"),
-        ("offsets", np.zeros((3, 3)), r"offsets \(3, 3\), expected \(22, 3\)"),
+        ("trans", np.full((3, 3), np.inf), "trans has dtype"),
+        ("offsets", np.zeros((3, 3)), r"offsets have shape \(3, 3\), expected \(22, 3\)"),
         ("offsets", np.zeros((22, 3)), "a person of"),
-        ("mocap_framerate", np.zeros(()), "needs mocap_framerate"),
-        ("mocap_framerate", np.array([30, 30]), "needs mocap_framerate"),
-        ("mocap_framerate", np.array("30"), "mocap_framerate holds"),
+        ("mocap_framerate", np.zeros(()), "mocap_framerate must be a positive number"),
+        ("mocap_framerate", np.array([30, 30]), "mocap_framerate must be a positive number"),
+        ("mocap_framerate", np.array("30"), "mocap_framerate has dtype <U2"),
     ],
 )
 def test_arrays_that_are_no_motion_are_an_error(name, value, message, tmp_path):
@@ -275,5 +275,5 @@ def test_arrays_that_are_no_motion_are_an_error(name, value, message, tmp_path):
 def test_an_npz_without_motion_in_a_folder_is_an_error(tmp_path):
     _, path = small("amass", tmp_path)
     np.savez(path.parent / "z.npz", weights=np.zeros(3))
-    with pytest.raises(ValueError, match=r"z\.npz: it holds weights, expected AMASS's poses and trans"):
+    with pytest.raises(ValueError, match=r"z\.npz: it contains weights, expected AMASS's poses and trans"):
         read_motion(path.parent)

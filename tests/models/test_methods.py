@@ -366,9 +366,10 @@ def test_networks_are_connected_as_in_the_papers():
 
 
 def test_the_example_method_of_the_docs_works_and_has_a_new_name():
-    page = (DOCS / "methods.md").read_text()
+    page = (DOCS / "how-to" / "new_method.md").read_text(encoding="utf-8")
+    definition = page.split("```python\n")[1].partition("\npeople = ")[0]
     space = {}
-    exec(compile(page.split("```\n")[1], "docs/methods.md", "exec", dont_inherit=True), space)
+    exec(compile(definition, "new_method.md", "exec", dont_inherit=True), space)
     kind = space["SecondOrder"]
     assert kind.name not in dvae.methods()
     assert f"{kind.name} = " in page

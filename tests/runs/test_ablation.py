@@ -180,7 +180,7 @@ def test_a_comparison_of_other_models_is_an_error(fitted):
     ("arguments", "message"),
     [
         ([], "give the name of a method, or --generative"),
-        (["srnn", "--inference", SMOOTHER], "--inference is the guide of --generative; srnn has its own"),
+        (["srnn", "--inference", SMOOTHER], "--inference is the guide for --generative, but srnn has its own guide"),
         (["hit-dvae"], "ablate one of vae, dkf, storn"),
         (["srnm"], "did you mean 'srnn'?"),
         (["srnn", "--steps", "3"], "give --out DIR"),

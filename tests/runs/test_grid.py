@@ -111,7 +111,7 @@ def table(tmp_path):
         ("training.seed = 3\n[a]\nmethod='vae'", r"seeds = \[...\] instead"),
         ("['../a']\nmethod='vae'", "cannot name run directories"),
         ("[a]\neach.inference=['faithful', 'q(z_t | x_t)']", "each text value its own table"),
-        ("[a]\nmethod='vae'\neach.latent=[3]\n['a-latent=3']\nmethod='srnn'", "another table's run"),
+        ("[a]\nmethod='vae'\neach.latent=[3]\n['a-latent=3']\nmethod='srnn'", "two tables give a run the name"),
         ("[a]\nx=" + "[" * 3000, "is not TOML"),
         ("steps = 3\n[a]\nmethod='vae'", "steps = 3 is in no table"),
         ("[a]\nmethod='srn'", r"\[a\]: unknown method 'srn' \(did you mean 'srnn'\?\)"),
@@ -131,7 +131,7 @@ def test_an_invalid_grid_is_an_error_with_its_table(study, text, message):
 def test_the_command_line_accepts_methods_or_a_grid(study, tmp_path, capsys):
     out = ["--out", str(tmp_path / "runs")]
     for arguments, message in (
-        (["vae", "--grid", str(study)], "no method and --grid"),
+        (["vae", "--grid", str(study)], "give either methods or --grid"),
         (["--grid", str(study), "--latent", "3"], "each.latent"),
         (["--grid", str(tmp_path / "none.toml")], "none.toml"),
     ):

@@ -109,7 +109,7 @@ def test_wrong_arguments_are_errors(data, tmp_path):
     for methods, seeds, message in (
         ([], [0], "at least one method"),
         ([VAE], [], "at least one method and one seed"),
-        ([VAE], [0, 0], r"each once, got seeds \[0, 0\]"),
+        ([VAE], [0, 0], r"without duplicates, got seeds \[0, 0\]"),
         ([VAE, VAE], [0], "vae is given twice"),
         ({"a/b": VAE}, [0], "cannot name a directory"),
     ):
@@ -166,8 +166,8 @@ def test_a_warning_of_several_runs_is_shown_once(data, tmp_path):
 def test_wrong_arguments_exit_with_2_before_any_work(tmp_path, capsys):
     out = ["--out", str(tmp_path / "runs")]
     for arguments, message in (
-        (["sweep", *out], "at least one method and one seed"),
-        (["sweep", "vae", "--seeds", *out], "at least one method and one seed"),
+        (["sweep", *out], "either methods or --grid, and at least one seed"),
+        (["sweep", "vae", "--seeds", *out], "either methods or --grid, and at least one seed"),
         (["sweep", "vae", "--jobs", "0", *out], "--jobs is 0"),
         (["sweep", "vae", "--latent", "0", *out], "latent is 0"),
         (["sweep", "vae", "--steps", "0", *out], "steps is 0"),

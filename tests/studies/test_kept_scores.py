@@ -7,7 +7,7 @@ import pytest
 
 import dvae
 from benchmarks import bench
-from benchmarks.studies import engine, papers, ranking, results, tuning
+from benchmarks.studies import engine, pairs, papers, ranking, results, tuning
 from dvae.models.motion.poses import PoseMethod
 from dvae.motion import WALKER
 
@@ -75,6 +75,7 @@ def test_tables_are_those_of_the_scores(tmp_path):
     tuning.main(tmp_path, results=tmp_path)
     papers.main(tmp_path, results=tmp_path, pictures=tmp_path)
     ranking.main(tmp_path, results=tmp_path, picture=tmp_path / "ranking.png")
+    pairs.main(results=tmp_path)
     bench.tabulate(json.loads(bench.HISTORY.read_text()), tmp_path)
     made = [*tmp_path.glob("*/*.csv"), *tmp_path.glob("*/*.txt")]
     assert {file.parent.name for file in made} == {"gsps", "hit_dvae", "index", "speed", "trajevae", "tuning"}

@@ -904,7 +904,7 @@ def test_products_alone_are_those_of_the_work():
 
 
 def test_overview(tmp_path):
-    overview.main(tmp_path / "overview.png", steps=1, clips=40)
+    overview.main(tmp_path / "overview.png", steps=1)
     assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
 
 

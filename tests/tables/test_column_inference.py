@@ -291,7 +291,7 @@ def test_invalid_parts_of_a_time_are_named():
     for parts, message in [
         (("year", "month", "day"), "row 1 of year month day is not a date: 2023-02 has no day 29"),
         (("year", "month", "hour"), "row 0 of column 'hour' is 0; expected days from 1"),
-        (("year", "month", "minute"), "year month minute have a minute without the next larger unit"),
+        (("year", "month", "minute"), "a column of minutes but no column of the next larger unit"),
         (("year", "y"), "row 0 of column 'y' is 0.5; expected months from 1 to 12"),
     ]:
         with pytest.raises(ValueError, match=message):

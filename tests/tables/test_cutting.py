@@ -103,8 +103,8 @@ def test_too_few_sequences_or_groups_to_split_are_an_error():
     ("options", "message"),
     [
         ({"observed": 3}, "give both, or neither"),
-        ({"split": "time"}, "give the number of observed steps, and a horizon"),
-        ({"validation": 0.5, "test": 0.5}, "leave nothing to train on"),
+        ({"split": "time"}, "give the numbers of steps as observed and horizon"),
+        ({"validation": 0.5, "test": 0.5}, "their sum must be below 1"),
         ({"observed": 0, "horizon": 1}, "observed is 0; it must be at least 1"),
         ({"test": 1.5}, "test is 1.5; it must be between 0 and 1"),
     ],

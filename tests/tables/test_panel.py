@@ -257,7 +257,7 @@ def test_times_are_read_in_every_notation(freq, notation):
         (["2020-01", "2021-01", "2021-01"], "two rows at t 2021-01-01 00:00:00, 1 and 2; .* if clocks were set back"),
         (["2020-01-01T01:00+01:00", "2020-01-02", "2020-01-03"], "and others, such as '2020-01-02', have none"),
         (["2020", None, "2021"], "row 1 of column 't' has no time"),
-        (["1/2/2020", "13/2/2020", "2/13/2020"], "nor durations: some begin with the day and others with the m"),
+        (["1/2/2020", "13/2/2020", "2/13/2020"], "nor durations: some dates begin with the day and others with"),
         (
             ["30/1/2020", "30/2/2020", "30/3/2020"],
             "nor durations: '30/2/2020' in row 1; write dates as 2024",

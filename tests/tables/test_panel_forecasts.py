@@ -275,7 +275,7 @@ def test_forecasts_are_draws_of_the_model(data, model):
     assert result.keys == [(name, start + 5) for _, name, start in test.keys]
     assert (test.forecast(model, 4, seed=4).draws != result.draws).any()
     assert list(result.columns.values()) == ["people", "°C", "", "", "", "", ""]
-    with pytest.raises(ValueError, match="whole sequences have no future; cut them"):
+    with pytest.raises(ValueError, match="whole sequences have no future; to forecast, cut them"):
         data.whole().forecast(model)
 
 

@@ -298,5 +298,6 @@ def test_a_declared_season_is_repeated():
     windows = data.windows("test")
     rows = dvae.evaluate({}, windows, references=["seasonal"], progress=False)
     assert rows["seasonal"]["CRPS"].mean == 0
-    with pytest.raises(ValueError, match="season is 7 and observed 5; a period"):
+    assert data.whole().all()["x"].shape == (1, len(days), 1)  # a whole sequence has no season to repeat
+    with pytest.raises(ValueError, match="season is 7 and observed 5; season must be at most"):
         Cut(5, 5, season=7)

@@ -156,7 +156,7 @@ def test_a_pipe_or_folder_is_an_error_at_once(tmp_path):
     os.mkfifo(tmp_path / "a.csv")
     (tmp_path / "b.csv").mkdir()
     for name in ("a.csv", "b.csv"):
-        with pytest.raises(ValueError, match=f"{name} is no file but"):
+        with pytest.raises(ValueError, match=f"{name} must be a plain file"):
             read_frame(tmp_path / name)
     with pytest.raises(FileNotFoundError):
         read_frame(tmp_path / "c.csv")

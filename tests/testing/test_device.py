@@ -320,5 +320,5 @@ class TestOnDevice:
             x = self.here.to("cuda")
         with pytest.raises(RuntimeError, match="exists only in a block of on_device"):
             x + 1
-        with on_device(), pytest.raises(TypeError, match="has no array; move it to the CPU first"):
+        with on_device(), pytest.raises(TypeError, match="cannot become an array; move it to the CPU first"):
             x.numpy()

@@ -198,7 +198,7 @@ def test_other_data_are_an_error(tmp_path, exact, change, message):
     model, x, _ = exact
     batch = {"x": x, "lengths": torch.tensor([3, 3, 3, 3])}
     regression(tmp_path).check(model.model, model.guide, batch, particles=5)
-    with pytest.raises(ValueError, match=f"is of other data: .*{message}"):
+    with pytest.raises(ValueError, match=f"was made with other data: .*{message}"):
         regression(tmp_path).check(model.model, model.guide, change(batch), particles=5)
 
 
@@ -236,7 +236,7 @@ def test_wrong_arguments_are_errors(tmp_path, exact):
         regression(tmp_path, strict=True).check(model.model, model.guide, x)
     assert not list(tmp_path.iterdir())
     check(model.model, model.guide, x, particles=5)
-    with pytest.raises(ValueError, match=r"is of 5 particles, not of 6: .* pass particles=5"):
+    with pytest.raises(ValueError, match=r"has 5 particles, the test 6: .* pass particles=5"):
         regression(tmp_path).check(model.model, model.guide, x, particles=6)
 
 

@@ -10,7 +10,8 @@ skeleton, relative to the same directions of the body at rest:
   that the neck has the right direction (in cmu8, this reduces its error from 28 to 12 mm).
 * **limbs**: along their bones. The twist of a thigh or an upper arm is minimal relative to the trunk while the limb is
   straight, and follows its hinge when the knee or elbow is bent.
-* **neck**: towards the head. **Ankles**: towards the toes, minus the slope of a foot that stands flat.
+* **neck**: towards the head.
+* **ankles**: towards the toes. The slope of a foot that stands flat in the source counts as zero rotation.
 * **Joints without children**, and joints that the source does not have, keep their rest rotation relative to the
   parent.
 
@@ -60,10 +61,12 @@ MIN_DISTANCE = 0.03
 """Minimum distance in metres between clavicles; closer ones begin in the middle of the body and are ignored."""
 
 ALIKE = 0.5
-"""Minimum cosine between bones at rest for rotations to be comparable between two rest poses; hanging arms are at 0."""
+"""Minimum cosine between the directions of a bone in two rest poses whose rotations are comparable.
+
+An arm that hangs in one rest pose and points to the side in the other has cosine 0."""
 
 _LIMBS = {"hip knee ankle": (1.0, 0.0, 0.0), "shoulder elbow wrist": (0.0, -1.0, 0.0)}
-"""Limbs of the left side, and the axis about which they bend at rest; it is mirrored for the right side."""
+"""Limbs, and the axis about which the left one bends at rest; the axis is mirrored for the right side."""
 
 _NEEDED = ["pelvis", *(f"{side} {part}" for limb in _LIMBS for part in limb.split() for side in "lr")]
 
@@ -80,9 +83,9 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
             equal for all clips with the same lengths.
 
     Returns:
-        The same clips with y up, with positions of the body's joints in metres, and rotations. `shapes_of` returns the
-        shape parameters. The rest pose of the skeleton belongs to the mean shape. The translation of the body is the
-        position of its root minus its position at rest.
+        The same clips with y up, with positions of the body's joints in metres, and rotations. `shapes_of` returns
+        their shape parameters. The rest pose of the skeleton is the mean over clips. The `translation` of
+        `Body.forward` is the position of the root minus the root's position at rest.
 
     Raises:
         ValueError: a required joint is missing in the skeleton or in a frame, or the shapes have a wrong size.
@@ -124,7 +127,12 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
 def shapes_of(motion: MotionSet, body: Body) -> Tensor:
     """Return shape parameters (N, S) of clips from `fit_to_body`, `retarget` or `TimedFrames.back`.
 
-    They are computed from the offsets of joints by `Body.shape_of`. For other motion they are meaningless.
+    The parameters are computed from the offsets of joints by `Body.shape_of`. For other motion, the result is
+    meaningless.
+
+    Args:
+        motion: N clips with rotations of the body's joints.
+        body: body that the motion was fitted to.
 
     Raises:
         ValueError: the clips have other joints, or no rotations.
@@ -158,7 +166,11 @@ def retarget(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
 def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
     """Return the shape parameters in AMASS's files, (N, S): the first values of each clip's label `betas`.
 
-    They are valid only for the body that the files were fitted with, usually SMPL-H (`read_body`).
+    The parameters are valid only for the body that the files were fitted with, usually SMPL-H (`read_body`).
+
+    Args:
+        motion: N clips read from files in AMASS's layout.
+        parameters: number of shape parameters S.
 
     Raises:
         ValueError: a clip has no betas, or too few.
@@ -179,10 +191,10 @@ class _Source(NamedTuple):
     """Corresponding joints of a skeleton and of a body.
 
     Attributes:
-        source_joints: joints of the skeleton by part, for the parts that both have.
-        body_joints: joints of the body.
+        source_joints: indices of the skeleton's joints by part, for the parts that both have.
+        body_joints: indices of the body's joints by part.
         waist, top: parts where the spine begins and ends.
-        girdle: part on both sides of the chest.
+        girdle: pair of joints that gives the left-right direction of the chest, "clavicle" or "shoulder".
     """
 
     source_joints: Mapping[str, int]
@@ -222,11 +234,15 @@ class _Source(NamedTuple):
         )
 
     def marks(self, positions: Tensor) -> dict[str, Tensor]:
-        """Return positions (..., 3) by part, from the skeleton's joints (..., J, 3)."""
+        """Return positions (..., 3) of parts, and of the midpoints of hips and shoulders, from joints (..., J, 3)."""
         return _marks(positions, self.source_joints)
 
     def lengths(self, marks: Mapping[str, Tensor]) -> Tensor:
-        """Return lengths (..., 8) in metres: limbs (mean of both sides), widths, trunk to shoulders and to top."""
+        """Return eight lengths (..., 8) in metres.
+
+        They are the four bones of limbs (means of both sides), the widths of hips and shoulders, and the lengths of
+        the trunk from the hips to the shoulders and to `top`.
+        """
 
         def length(start: str, end: str) -> Tensor:
             lengths_of_bone: Tensor = (marks[end] - marks[start]).norm(dim=-1)
@@ -251,7 +267,12 @@ class _Source(NamedTuple):
         return torch.from_numpy(scipy.optimize.least_squares(off, np.zeros(size), bounds=(-MOST, MOST)).x)
 
     def steepness(self, clips: Iterable[Mapping[str, Tensor]], fps: float) -> Tensor:
-        """Return the median angle of descent from ankles to toes for feet that stand flat; NaN if none does."""
+        """Return the median angle in radians by which toes are below ankles in feet that stand flat; NaN if none does.
+
+        Args:
+            clips: positions (F, 3) by part of each clip.
+            fps: frames per second.
+        """
         slopes = [torch.zeros(0, dtype=torch.float64)]
         if self.source_joints.keys() >= {"l toe", "r toe"}:
             for marks in clips:
@@ -348,12 +369,12 @@ def _align(start: tuple[Tensor, Tensor], end: tuple[Tensor, Tensor]) -> Tensor:
 
 
 def _descent(bones: Tensor) -> Tensor:
-    """Return the angle of bones (..., 3) below the horizontal."""
+    """Return the angles (...,) in radians of bones (..., 3) below the horizontal."""
     return torch.atan2(-bones[..., 1], bones[..., [0, 2]].norm(dim=-1))
 
 
 def _direction(bone: Tensor, angle: Tensor) -> Tensor:
-    """Return a unit vector in the horizontal direction of a bone (3,), at this angle below the horizontal."""
+    """Return a bone (3,) as a unit vector with the same heading, at this angle in radians below the horizontal."""
     ahead = normalize(bone * bone.new_tensor([1.0, 0, 1]), dim=-1)
     return ahead * angle.cos() - bone.new_tensor([0.0, 1, 0]) * angle.sin()
 
@@ -390,13 +411,17 @@ def _shapes(shapes: Tensor, motion: MotionSet, body: Body) -> Tensor:
     size = body.parameters_of_shape
     if shapes.shape not in ((size,), (len(motion), size)):
         raise ValueError(
-            f"shapes are {tuple(shapes.shape)}, expected ({size},) or ({len(motion)}, {size}) with a row for each clip"
+            f"`shapes` has shape {tuple(shapes.shape)}, expected ({size},) for all clips or ({len(motion)}, {size}) "
+            "with a row for each clip"
         )
     return shapes.detach().cpu().double().expand(len(motion), size)
 
 
 def _known_shapes(motion: MotionSet, body: Body) -> Tensor:
-    """Return shapes (N, S) of motion that has the body's rotations: from joint offsets, or else from bone lengths."""
+    """Return shape parameters (N, S) of motion with rotations of the body's joints.
+
+    They are computed from joint offsets, or from bone lengths if no body has these offsets.
+    """
     source, shapes = _Source.of(motion, body), []
     for offsets in resting_offsets(motion):
         shape = body.shape_of(offsets)
@@ -428,8 +453,8 @@ def _has_matching_rotations(motion: MotionSet, body: Body) -> bool:
 def _check(motion: MotionSet, body: Body) -> None:
     if not _has_matching_rotations(motion, body):
         raise ValueError(
-            f"{motion.name or 'this motion'} does not have the joints of the body, or its rotations do not start from "
-            "its rest pose; dvae.motion.bodies.fit_to_body converts it"
+            f"{motion.name or 'this motion'} has other joints than the body, or rotations relative to another rest "
+            "pose; convert it with dvae.motion.bodies.fit_to_body"
         )
 
 

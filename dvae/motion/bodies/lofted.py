@@ -1,9 +1,9 @@
 """A person defined by code: closed parts lofted along the bones of SMPL's 22 joints, and eight shape parameters.
 
-A part is a chain of rings of vertices, closed at both ends around the centre of the ring. The position and width of a
-ring are linear in bone lengths and girths, which are linear in the parameters. The vertices are therefore linear too,
-and their changes are blend shapes. Around each joint is a ring with two opposite vertices whose midpoint is the joint;
-these vertices define the regressor.
+A part is a chain of rings of vertices. Triangles to the centre of its first and last ring close it. The position and
+width of a ring are linear in bone lengths and girths, which are linear in the parameters. The vertices are therefore
+linear in the parameters, and their changes per parameter are the blend shapes. Around each joint is a ring with two
+opposite vertices whose midpoint is the joint; the regressor averages these two vertices.
 
 A parameter value of 1 is roughly one standard deviation: about one person in six differs as much. The numbers are our
 own choice for a body that looks human; they are not fitted to people. If all parameters are between -3 and 3, no part
@@ -27,8 +27,8 @@ from .skinning import Body
 SHAPE = ("size", "girth", "legs", "arms", "torso", "shoulders", "hips", "head")
 """The shape parameters, in order.
 
-Size scales everything, head scales the head, and girth scales the widths and depths of all else. Legs, arms and
-torso are lengths; shoulders and hips are widths."""
+Size scales everything, head scales the head, and girth scales the widths and depths of trunk, legs and arms. Legs, arms
+and torso are lengths; shoulders and hips are widths."""
 
 MARKERS = {
     **{"forehead": 381, "breastbone": 184, "back": 193, "sacrum": 67},
@@ -37,7 +37,7 @@ MARKERS = {
 }
 """Vertices of `human()` at typical marker positions.
 
-They are on top of shoulders, behind elbows, on the back of wrists, and in front of knees."""
+The markers of limbs are on top of shoulders, behind elbows, on the back of wrists, and in front of knees."""
 
 _SIZE = 0.04
 _LENGTHS = {  # parameter: factor, axes, bones (named by their ends)
@@ -85,7 +85,7 @@ _BONES = {
     for name, parent in zip(JOINTS, PARENTS, strict=True)
     if parent >= 0 and not name.startswith("R_")
 } | _ENDS
-"""Bones in the middle and on the left, by their ends: start and offset."""
+"""Bones in the middle and on the left: name of the end -> name of the start, and offset in metres."""
 
 
 class _Ring(NamedTuple):
@@ -95,7 +95,7 @@ class _Ring(NamedTuple):
         start, end: ends of the bone.
         along: position on the bone, 0 at its start and 1 at its end.
         width: half width in metres.
-        front, back: depth in the positive and negative direction of the second axis, in metres.
+        front, back: depth in metres, in the positive and negative direction of the second of the part's axes.
     """
 
     start: str
@@ -111,8 +111,8 @@ class _Part(NamedTuple):
 
     Attributes:
         around: number of vertices of a ring, even.
-        axes: axes of width and depth.
-        paired: whether the part also exists on the right; the numbers are for the left.
+        axes: axis of the width, then axis of the depth, such as "xz".
+        paired: whether the part also exists on the right; the rings are defined for the left.
         rings: rings from one end to the other.
     """
 
@@ -214,7 +214,7 @@ _MOST = 4
 """Maximum number of joints that move a vertex."""
 
 _WEIGHT_WIDTH = 0.015
-"""Additional distance of a bone, in metres, at which its skinning weight is smaller by a factor of e."""
+"""Additional distance in metres from a bone that divides its skinning weight by e."""
 
 
 def human() -> Body:
@@ -264,7 +264,7 @@ def _joint(name: str, side: str) -> int | None:
 
 
 def _places(parameters: Tensor) -> dict[str, Tensor]:
-    """Return positions (3,) of joints and ends in the middle and on the left."""
+    """Return positions (3,) in metres, by name, of the joints and bone ends in the middle and on the left."""
     shape = dict(zip(SHAPE, parameters, strict=True))
     places = {"Pelvis": parameters.new_zeros(3)}
     for name, (parent, offset) in _BONES.items():
@@ -340,7 +340,7 @@ def _weights(part: _Part, side: str, vertices: Tensor) -> Tensor:
 
 
 def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:
-    """Return the distances (V,) of points (V, 3) from a segment."""
+    """Return the distances (V,) of points (V, 3) from the line segment between two points (3,)."""
     bone = end - start
     along = ((points - start) @ bone / bone.square().sum()).clamp(0, 1)
     distances: Tensor = (points - start - along[:, None] * bone).norm(dim=-1)

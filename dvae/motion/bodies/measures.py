@@ -9,11 +9,14 @@ def vertex_error(vertices: Tensor, truth: Tensor) -> Tensor:
     """Return the mean distance between the vertices of two surfaces, over vertices and frames, in metres.
 
     Args:
-        vertices: (..., T, V, 3), of the same body as the truth.
-        truth: (..., T, V, 3).
+        vertices: (..., T, V, 3) in metres, with the same vertex order as the truth.
+        truth: (..., T, V, 3) in metres.
 
     Returns:
         Errors (...,).
+
+    Raises:
+        ValueError: the shapes differ.
     """
     if vertices.shape != truth.shape:
         raise ValueError(
@@ -25,11 +28,11 @@ def vertex_error(vertices: Tensor, truth: Tensor) -> Tensor:
 
 
 def enclosed_volume(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Return the volume inside a closed surface in cubic metres; overlaps of several surfaces count repeatedly.
+    """Return the volume inside closed surfaces in cubic metres; the overlap of two surfaces counts twice.
 
     Args:
-        vertices: (..., V, 3).
-        faces: (F, 3), counterclockwise from outside.
+        vertices: (..., V, 3) in metres.
+        faces: (F, 3), vertex indices of triangles, counterclockwise from outside.
 
     Returns:
         Volumes (...,): the sum of the signed tetrahedra between the origin and the triangles. For a closed surface it

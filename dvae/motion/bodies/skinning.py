@@ -3,8 +3,9 @@ corrections.
 
     v(beta) = template + shapes beta,    j(beta) = regressor v(beta),    x_v = sum_j weights_vj (W_j (v_v - j_j) + p_j)
 
-W_j is the rotation of a joint relative to the world and p_j its position, both by forward kinematics. For one body this
-is a single matrix product over all frames: of the poses, (3 T, 4 J), and the surface, (4 J, V).
+W_j is the rotation of a joint relative to the world and p_j its position, both by forward kinematics. For one body, the
+vertices of all T frames are a single matrix product of the joint transforms, (3 T, 4 J), and the weighted surface,
+(4 J, V).
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ RANK_TOLERANCE = 1e-5
 
 
 class Body(nn.Module):
-    """A surface on a tree of joints, with shape parameters. Metres, y up, facing +z.
+    """A surface on a tree of joints, with shape parameters.
 
-    Its tensors are non-persistent buffers and never part of a state dict. The file of a body may have a restrictive
-    licence, and must then not be distributed with the weights of a model.
+    Coordinates are in metres with y up; at rest the body faces +z. The tensors are non-persistent buffers and never
+    part of a state dict, because the licence of a body's file may forbid to distribute it with a model.
 
     Args:
         names: joint names.
@@ -83,11 +84,14 @@ class Body(nn.Module):
         return len(self.names)
 
     def at_rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
-        """Return vertices (..., V, 3) and joints (..., J, 3) of bodies (..., S) in the rest pose."""
+        """Return vertices (..., V, 3) and joints (..., J, 3) in metres at rest, from shape parameters (..., S)."""
         return _changed(self.template, self.shapes, shape), self._pivots(shape)
 
     def offsets(self, shape: Tensor) -> Tensor:
-        """Return rest offsets (..., J, 3) of joints from their parents in metres, of bodies (..., S); root: 0."""
+        """Return rest offsets (..., J, 3) of joints from their parents in metres, from shape parameters (..., S).
+
+        The offset of the root is 0.
+        """
         average, changes = self._bones()
         return (average + (changes @ shape[..., None, :, None].to(average)).squeeze(-1)).to(shape)
 
@@ -95,8 +99,8 @@ class Body(nn.Module):
         """Return shape parameters (..., S) of bodies with these joint offsets at rest, (..., J, 3) in metres.
 
         Offsets are linear in the parameters, so this inverts `offsets` where joints determine a parameter; for the
-        bundled person, these are all except girth. Undetermined parameters are 0. Offsets outside the range of shapes
-        give the nearest shape.
+        bundled person, these are all except girth. Undetermined parameters are 0. For offsets that no shape has, the
+        result is the least-squares solution.
         """
         average, changes = self._bones()
         parameters = torch.linalg.pinv(changes.flatten(0, 1), rtol=RANK_TOLERANCE)
@@ -117,8 +121,8 @@ class Body(nn.Module):
             shape: (..., S), shape parameters of each body.
             rotations: (..., T, J, 3, 3), matrices of joints relative to their parents and of the root relative to the
                 world; `rotations.to_matrix` converts other forms.
-            translation: (..., T, 3) in metres, from the rest position, applied after the rotation about the root. The
-                root is at its rest position plus this, as in `smplx`.
+            translation: (..., T, 3) in metres, added after the rotation about the root. The root is at its rest
+                position plus the translation, as in `smplx`.
 
         Returns:
             vertices (..., T, V, 3) and joints (..., T, J, 3), in metres.
@@ -140,6 +144,9 @@ class Body(nn.Module):
 
         Returns:
             Vertices (..., T, M, 3) in metres.
+
+        Raises:
+            ValueError: same as `forward`.
         """
         moves, _ = self._posed(shape, rotations, translation)
         if vertices.dim() == 1:
@@ -170,13 +177,16 @@ class Body(nn.Module):
     def squared_error(self, shape: Tensor, first: Sequence[Tensor], second: Sequence[Tensor]) -> Tensor:
         """Return the mean squared distance over vertices between two motions of the same bodies, (..., T) in m².
 
-        Vertices are linear in the joint transforms, so this is a quadratic form of 4 J numbers, and vertices are never
-        computed. With P and P' the transforms of two poses and S the surface: |P S - P' S|² = tr (P - P') S S^T (P -
-        P')^T.
+        Vertices are linear in the joint transforms, so the error is a quadratic form in 4 J numbers, and vertices are
+        never computed. With P and P' the transforms of two poses and V the surface: |P V - P' V|² = tr (P - P') V V^T
+        (P - P')^T.
 
         Args:
             shape: (..., S), shape parameters of each body.
             first, second: rotations (..., T, J, 3, 3) and translation (..., T, 3) of each motion, as in `forward`.
+
+        Raises:
+            ValueError: same as `forward`.
         """
         for motion in (first, second):
             self._check(shape, *motion)
@@ -193,13 +203,13 @@ class Body(nn.Module):
         return errors
 
     def _weighted(self, shape: Tensor) -> Tensor:
-        """Return vertices at rest, weighted by joint, (..., V, 4 J)."""
+        """Return homogeneous vertices at rest times their weight for each joint, (..., V, 4 J)."""
         resting = _changed(self.template, self.shapes, shape)
         surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
         return (self.weights[..., None] * surface[..., None, :]).flatten(-2)
 
     def _pivots(self, shape: Tensor) -> Tensor:
-        """Return joints at rest (..., J, 3) directly; they are linear in the shape, and fewer than vertices."""
+        """Return joints at rest (..., J, 3) without computing vertices, since joints are linear in the shape too."""
         changes = (self.regressor @ self.shapes.flatten(1)).unflatten(-1, (3, -1))
         return _changed(self.regressor @ self.template, changes, shape)
 

@@ -17,13 +17,13 @@ from ..files.smpl import JOINTS, PARENTS
 from .skinning import Body
 
 LARGEST = 2**27
-"""Maximum size of an array in bytes; the largest of SMPL-X has three quarters of it."""
+"""Maximum size of an array in bytes; the largest array of SMPL-X has three quarters of this size."""
 
 MOST_VERTICES = 2**17
-"""Maximum number of vertices; SMPL-X has a twelfth of it."""
+"""Maximum number of vertices; SMPL-X has a twelfth of this number."""
 
 FURTHEST = 1e3
-"""Maximum absolute value in a body; metres and weights are smaller."""
+"""Maximum absolute value in an array; positions in metres and weights are far smaller."""
 
 _MEMBERS: dict[str, tuple[str | int, ...]] = {  # member -> its axes: vertices, shape parameters, joints, faces
     "v_template": ("V", 3),
@@ -39,20 +39,22 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
     """Read a model file, npz, of SMPL, SMPL-H or SMPL-X.
 
     The body has the 22 joints of trunk and limbs that these models share. Fingers, jaw and eyes are not rotated: their
-    weights are added to the joint that they descend from.
+    weights are added to the nearest ancestor among the 22 joints.
 
     Args:
-        path: model file.
-        shapes: number of shape parameters, the first ones of the file.
+        path: npz file of the model.
+        shapes: number of shape parameters S; the first S of the file are used.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: it is damaged, too large, or not a body.
+        ValueError: the file is damaged, too large, or not a body; or `shapes` is not between 1 and the file's number.
     """
     path = Path(path)
     with archive(path) as members:
         if missing := [name for name in _MEMBERS if name not in members]:
-            raise ValueError(f"{path}: not a body file with {', '.join(_MEMBERS)}; it has no {', '.join(missing)}")
+            raise ValueError(
+                f"{path} is not a body file: it has no {', '.join(missing)}; expected {', '.join(_MEMBERS)}"
+            )
         for name in _MEMBERS:
             if members[name].size > LARGEST:
                 raise ValueError(f"{path}: {name} has {members[name].size:,} bytes; a body has at most {LARGEST:,}")
@@ -80,19 +82,19 @@ def _defect(arrays: dict[str, np.ndarray], shapes: int) -> str:
         expected = tuple(sizes.get(axis, 0) for axis in axes)
         if array.shape != expected or not array.size or array.dtype.kind not in ("iu" if is_integer else "fiu"):
             kind = "whole numbers" if is_integer else "numbers"
-            return f"{name} holds {array.dtype} {array.shape}, expected {kind} ({', '.join(map(str, axes))})"
+            return f"{name} has {array.dtype} {array.shape}, expected {kind} ({', '.join(map(str, axes))})"
         if not is_integer and not (np.abs(array) <= FURTHEST).all():
-            return f"{name} holds numbers that are NaN or beyond {FURTHEST:g}"
+            return f"{name} has values that are NaN or above {FURTHEST:g} in absolute value"
     if sizes["V"] > MOST_VERTICES:
         return f"it has {sizes['V']:,} vertices; a body has at most {MOST_VERTICES:,}"
     if not 1 <= shapes <= sizes["S"]:
-        return f"it has {sizes['S']} parameters of shape, not {shapes}; give their number with shapes="
+        return f"it has {sizes['S']} shape parameters, so `shapes` must be from 1 to {sizes['S']}, got {shapes}"
     parents = arrays["kintree_table"][0].astype(np.int64)
     if tuple(parents[1 : len(JOINTS)]) != PARENTS[1:] or not (parents[1:] < np.arange(1, len(parents))).all():
-        return f"its tree is not SMPL's; expected the first joints {', '.join(JOINTS)}"
+        return f"kintree_table is not SMPL's joint tree, whose first joints are {', '.join(JOINTS)}"
     if (parents[1:] < 0).any() or arrays["f"].min() < 0 or arrays["f"].max() >= sizes["V"]:
         return f"a face or a joint refers to an index that does not exist; it has {sizes['V']} vertices"
     for name in ("weights", "J_regressor"):
         if not np.allclose(arrays[name].astype(np.float64).sum(1), 1, atol=1e-3):
-            return f"{name} must be shares that add up to 1, but they do not"
+            return f"each row of {name} must sum to 1, but some rows do not"
     return ""

@@ -45,8 +45,8 @@ class Clip:
         split: split in the archive: "train", "test", or a subject.
         name: name, unique within the split.
         positions: (F, J, 3) in metres, global; NaN where a joint was not observed.
-        labels: text labels.
-        truth: true variables of a simulator, as arrays; empty for real clips.
+        labels: text labels, from name to value.
+        truth: true values of a simulator's variables, as arrays; empty for real clips.
         rotations: (F, J, 4), rotation of each joint relative to its parent, as quaternions w x y z; from the file or
             from `MotionSet.with_rotations`. The rotation of a joint without children is not observable.
     """
@@ -74,16 +74,16 @@ class Clip:
         return len(self.positions)
 
     def between(self, start: int, end: int) -> Clip:
-        """Return the frames from `start` to before `end`."""
+        """Return the clip of the frames from `start` (inclusive) to `end` (exclusive)."""
         rotations = None if self.rotations is None else self.rotations[start:end]
         truth = {k: v[start:end] if v.shape[:1] == (self.frames,) else v for k, v in self.truth.items()}
         return replace(self, positions=self.positions[start:end], rotations=rotations, truth=truth)
 
     def resampled(self, ratio: float) -> Clip:
-        """Return the clip with one frame for every `ratio` frames, a real number.
+        """Return the clip with one frame for every `ratio` frames; `ratio` may be fractional.
 
-        A whole ratio selects frames. Otherwise positions are interpolated linearly and rotations along the shortest
-        arc. Simulator variables (`truth`) are dropped.
+        A whole ratio keeps every `ratio`-th frame. Otherwise, positions are interpolated linearly and rotations along
+        the shortest arc. Simulator variables (`truth`) are dropped.
         """
         if abs(ratio - round(ratio)) < 1e-6 and ratio >= 1:
             step = round(ratio)
@@ -120,11 +120,11 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
     """
     label, positions = f"clip {clip.split}/{clip.name}", clip.positions
     if positions.dtype.kind not in "fiu":
-        return f"{label} holds {positions.dtype}, expected numbers"
+        return f"{label} has dtype {positions.dtype}, expected numbers"
     if positions.ndim != 3 or positions.shape[2] != 3:
         return f"{label} has shape {positions.shape}, expected (frames, joints, 3)"
     if positions.shape[1] != skeleton.joints:
-        return f"{label} has {positions.shape[1]} joints, skeleton {skeleton.name!r} has {skeleton.joints}"
+        return f"{label} has {positions.shape[1]} joints, but the skeleton {skeleton.name!r} has {skeleton.joints}"
     if not len(positions):
         return f"{label} has no frames"
     count = frames = 0
@@ -167,14 +167,14 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
 def some_frames(positions: np.ndarray) -> np.ndarray:
     """Return at most `MOST_FRAMES` evenly spaced frames of (F, J, 3).
 
-    Return all frames if each of the chosen frames has missing joints.
+    If every one of these frames has missing joints, return all frames.
     """
     selected = positions[:: -(-len(positions) // MOST_FRAMES)]
     return positions if np.isnan(selected).any(axis=2).all() else selected
 
 
 def extents(positions: np.ndarray) -> np.ndarray:
-    """Return the extents (frames, 3) of the body along each axis, for the frames of (F, J, 3) with the most joints."""
+    """Return the body's extents (frames, 3) along the axes in the frames of (F, J, 3) with the most observed joints."""
     poses = fullest(positions)
     extent: np.ndarray = np.nanmax(poses, axis=1) - np.nanmin(poses, axis=1).astype(np.float64)
     return extent
@@ -188,7 +188,10 @@ def fullest(positions: np.ndarray) -> np.ndarray:
 
 
 def _as_float32(values: np.ndarray, copy: bool = True) -> np.ndarray:
-    """Return values as float32 in C order, copied if `copy` is set and memory is shared; mapped arrays stay mapped."""
+    """Return values as float32 in C order.
+
+    The result shares memory with `values` only if `copy` is False, or if the array is memory-mapped.
+    """
     if is_mapped(values) and values.dtype == np.float32 and values.flags.c_contiguous:
         return values
     array = np.require(values, np.float32, ["C", "A", "W"])
@@ -199,18 +202,18 @@ def _as_float32(values: np.ndarray, copy: bool = True) -> np.ndarray:
 class MotionSet:
     """Clips of one skeleton.
 
-    Iteration yields the clips. `motion["train", "walking_1"]` is one of them.
+    Iteration yields the clips. `motion["train", "walking_1"]` returns the clip with this split and name.
 
     Args:
         clips: clips, iterated once; copied as float32, except for memory-mapped float32 arrays.
         skeleton: skeleton of all clips.
         name: name of the set.
-        copy: False keeps float32 arrays without copying them; the caller must not use them any more.
+        copy: whether to copy float32 arrays; if False, the caller must no longer use them.
         skip_bad: leave out unusable clips, and list them in `skipped`.
         skipped: clips that were left out earlier, as (split, name, reason).
-        interpretation: how the units and axes of the files were interpreted, for people to check.
-        missing: joints may be NaN where they were not observed; a joint with one NaN coordinate counts as missing.
-            Windows then contain a mask of observed values.
+        interpretation: description of the units and axes that were assumed for the files, for the user to check.
+        missing: whether joints may be missing (NaN). A joint with one NaN coordinate counts as missing. Batches of
+            windows then contain a mask of observed values.
 
     Raises:
         ValueError: a clip has NaN although `missing` is not set, wrong joints, a wrong shape or implausible units; two
@@ -256,7 +259,7 @@ class MotionSet:
             raise ValueError(f"{label}: no clips{dropped}")
         repeated = [key for key, count in Counter(clip.key for clip in usable).items() if count > 1]
         if repeated:
-            raise ValueError(f"{label}: clip {'/'.join(repeated[0])} occurs twice")
+            raise ValueError(f"{label}: clip {'/'.join(repeated[0])} occurs twice; each split and name must be unique")
         fields = {"clips": tuple(usable), "skeleton": skeleton, "name": name, "skipped": tuple(left_out)}
         vars(self).update(
             fields, interpretation=interpretation, missing=missing, _index={clip.key: clip for clip in usable}
@@ -287,17 +290,17 @@ class MotionSet:
         return list(dict.fromkeys(clip.split for clip in self.clips))
 
     def with_rotations(self) -> MotionSet:
-        """Return the same motion with joint rotations and the rest pose that they rotate.
+        """Return the same motion with joint rotations and a rest pose.
 
-        Rotations from files are kept. The others are estimated by `kinematics.inverse`, for bones with their mean
-        lengths over all clips; positions do not change.
+        Rotations from files are kept. Other rotations are estimated by `kinematics.inverse`, which assumes that every
+        bone has its mean length over all clips. Positions do not change.
         """
         if self.skeleton.rest and all(clip.rotations is not None for clip in self):
             return self
         if incomplete := [clip for clip in self if clip.rotations is None and np.isnan(clip.positions).any()]:
             raise ValueError(
-                f"clip {'/'.join(incomplete[0].key)} has missing joints, so its rotations are not known; remove it, "
-                "or fill its gaps first (`dvae impute RUN --filled FILE`)"
+                f"clip {'/'.join(incomplete[0].key)} has missing joints, so rotations cannot be computed; leave the "
+                "clip out, or fill in the missing joints first (`dvae impute RUN --filled FILE`)"
             )
         result: MotionSet | None = self.__dict__.get("_with_rotations")
         if result is None:  # cached, because all splits use it
@@ -329,10 +332,10 @@ class MotionSet:
         """Return the same positions with extra joints where bones that share a joint move relative to each other.
 
         A joint has one rotation, which moves all its children together. Recordings may omit joints, for example where
-        the spine bends against the hips at the pelvis. `with_rotations` can then only find a compromise. This method
-        groups the children of a joint by rigidity: the distances within a group vary by less than a millimetre in every
-        clip. The largest group stays with the joint. Each other group gets a new joint at the same place, named after
-        its first child.
+        the spine bends against the hips at the pelvis. No rotation then fits all children of the joint, and
+        `with_rotations` returns the nearest fit. This method groups the children of a joint by rigidity: the distances
+        within a group vary by less than a millimetre in every clip. The largest group stays with the joint. Each other
+        group gets a new joint at the same place, named after its first child.
 
         Raises:
             ValueError: the motion already has rotations, or joints are missing.
@@ -373,26 +376,27 @@ class MotionSet:
             ValueError: `fps` is not positive.
         """
         if not 0 < fps < 1e6:
-            raise ValueError(f"{fps} frames per second, expected more than 0")
+            raise ValueError(f"`fps` must be above 0 and below 1e6 frames per second, got {fps}")
         ratio, skeleton = self.skeleton.fps / fps, replace(self.skeleton, fps=float(fps))
         return replace(self, clips=[clip.resampled(ratio) for clip in self], skeleton=skeleton)
 
     def divided(self, test: float = 0.2, shortest: int = 1) -> MotionSet:
         """Return the same motion in the splits "train" and "test", for recordings without splits.
 
-        The last part of every clip is for testing if both parts have at least `shortest` frames. If no clip is long
-        enough, the last clips are for testing. If there is only one clip, its training part is cut in two, so that a
-        part is available for validation. A split other than "all" becomes a prefix of the clip's name.
+        The last part of every clip becomes a test clip if both parts have at least `shortest` frames. If no clip is
+        long enough to be cut, the last clips of the set become test clips. If there is only one clip, its training part
+        is cut into two clips, so that one of them is available for validation. A split other than "all" becomes a
+        prefix of the clip's name.
 
         Args:
-            test: test fraction of every clip, or of the number of clips.
-            shortest: frames in a window.
+            test: fraction of the frames of every clip, or of the clips, that is used for testing.
+            shortest: minimum number of frames of each part, usually the length of a window.
 
         Raises:
             ValueError: `test` is not between 0 and 1.
         """
         if not 0 < test < 1:
-            raise ValueError(f"the share for test is {test}, expected more than 0 and less than 1")
+            raise ValueError(f"`test` must be a fraction above 0 and below 1, got {test}")
         clips: list[Clip] = []
         for clip in self:
             name = clip.name if clip.split == "all" else f"{clip.split}-{clip.name}".replace("/", "-")

@@ -42,7 +42,7 @@ def default_protocol(motion: MotionSet) -> Protocol:
 
 
 def apply_splits(motion: MotionSet, protocol: Protocol) -> MotionSet:
-    """Split undivided motion into "train" and "test" if the protocol needs these splits."""
+    """Return motion divided into "train" and "test" if the protocol needs these splits and the motion has neither."""
     needs_splits = (protocol.split_by, protocol.train, protocol.test) == ("split", ("train",), ("test",))
     if needs_splits and not {"train", "test"} & {*motion.splits}:
         return motion.divided(shortest=protocol.length)
@@ -51,7 +51,7 @@ def apply_splits(motion: MotionSet, protocol: Protocol) -> MotionSet:
 
 @dataclass(frozen=True)
 class Recordings:
-    """Record of where motion data were read.
+    """Record of the file from which motion data were read.
 
     Args:
         path: file as it was given, or "simulated".
@@ -106,11 +106,11 @@ class MotionData:
 
         Args:
             path: file or folder that `read_motion` reads, or "simulated" for `simulate()`.
-            protocol: one of `dvae.motion.PROTOCOLS` or its name; default: `default_protocol` of the clips.
-                `MotionSet.divided` divides clips whose split is neither "train" nor "test".
+            protocol: one of `dvae.motion.PROTOCOLS` or its name; default: `default_protocol` of the clips. If the
+                protocol needs the splits "train" and "test" and no clip has either, `MotionSet.divided` creates them.
             skip_bad: leave out unusable clips instead of raising an error.
             missing: keep clips in which joints are missing (NaN) in some frames.
-            representation: input of the models, overrides the protocol's.
+            representation: input of the models; overrides the representation of the protocol.
 
         Raises:
             FileNotFoundError: the file does not exist.
@@ -175,8 +175,9 @@ class MotionData:
     def reopened(cls, source: Recordings, schema: Poses, path: str | os.PathLike[str] | None = None) -> Self:
         """Open recorded data again, from the recorded path or from another one.
 
-        The content may have changed. Data with another skeleton are mapped to the skeleton of the schema if they have
-        all its joints, which are matched by name. Their rotations are then estimated again.
+        The content of the file may have changed since it was recorded. Data with another skeleton are mapped to the
+        skeleton of the schema if they have all its joints, which are matched by name. Their rotations are then
+        estimated again.
 
         Args:
             source: result of `recorded`.
@@ -194,8 +195,8 @@ class MotionData:
             return data
         if motion.skeleton.fps != skeleton.fps:
             raise ValueError(
-                f"{data.path} has {motion.skeleton.fps:g} frames per second, but these windows have {skeleton.fps:g}; "
-                f"`dvae data convert {data.path} --fps {skeleton.fps:g} --out FILE` resamples it"
+                f"{data.path} has {motion.skeleton.fps:g} frames per second, but the recorded windows have "
+                f"{skeleton.fps:g}; `dvae data convert {data.path} --fps {skeleton.fps:g} --out FILE` resamples it"
             )
         try:
             mapped = select_joints(motion, onto=skeleton)

@@ -21,17 +21,18 @@ from .protocols import Windows
 class ExchangedWindows:
     """Windows that begin with the pose of another window, for `dvae.evaluate`.
 
-    Window n keeps its frames and paths, except that its first frame is the one of a partner. The given joints of a
-    partner have nearly the same positions relative to the pelvis. Windows without a partner are left out. Multimodal
-    errors are undefined, because the windows that begin with the exchanged pose have different paths.
+    Window n keeps its frames and paths, except that its first frame is replaced with the first frame of a partner. A
+    partner is a window of another clip whose given joints have nearly the same positions relative to the pelvis.
+    Windows without a partner are left out. Multimodal errors are undefined, because the windows that begin with the
+    exchanged pose have different paths.
 
     Args:
         windows: windows with one observed frame and the same given joints everywhere, e.g. `windows.given(["LWrist"])`.
         threshold: maximum distance in metres between each given joint in the two first frames.
         seed: seed for the choice among partners.
-        own: keep every window's own pose, as a baseline on the same windows.
-        truth: whose motion is the truth: the window of the "path", as in TrajeVAE's text, or of the "pose", as in its
-            public code.
+        own: whether every window keeps its own pose, as a baseline on the same windows.
+        truth: window whose motion is the truth in scores: "path", the window of the paths, as in TrajeVAE's text, or
+            "pose", the window of the first pose, as in its public code.
 
     Raises:
         ValueError: windows have no given joints or more than one observed frame, the threshold is not positive, or no
@@ -55,13 +56,13 @@ class ExchangedWindows:
             )
         if windows.missing:
             raise ValueError(
-                "only whole poses can be exchanged, but these windows may have missing joints; fill the gaps first "
-                "(`dvae impute RUN --filled FILE`)"
+                "only whole poses can be exchanged, but these windows may have missing joints; fill them in "
+                "first (`dvae impute RUN --filled FILE`)"
             )
         if not threshold > 0:
-            raise ValueError(f"the threshold is {threshold}; it must be a positive distance in metres")
+            raise ValueError(f"`threshold` must be a positive distance in metres, got {threshold}")
         if truth not in ("path", "pose"):
-            raise ValueError(f"truth is {truth!r}; expected 'path' or 'pose', the window whose motion is the truth")
+            raise ValueError(f"`truth` must be 'path' or 'pose' (the window whose motion is the truth), got {truth!r}")
         self.windows, self.threshold, self.seed, self.missing = windows, threshold, seed, False
         self.own, self.truth = own, truth
         self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints
@@ -87,7 +88,7 @@ class ExchangedWindows:
         if not rows:
             raise ValueError(
                 f"no two windows of different clips have {', '.join(self.given_joints or ())} within "
-                f"{self.threshold:g} m; the nearest two are {nearest:.3g} m apart"
+                f"{self.threshold:g} m; the nearest two are {nearest:.3g} m apart; raise `threshold`"
             )
         return torch.tensor(rows), torch.tensor(partners)
 
@@ -95,7 +96,7 @@ class ExchangedWindows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Entries for a record: the description of the windows, and how poses were exchanged."""
+        """Description of the windows and of the exchange of poses, for the record of an evaluation."""
         description, partners = self.windows.description, len(self._partners.unique())
         exchanged = {"threshold": self.threshold, "seed": self.seed, "partners": partners, "truth": self.truth}
         title = [*description["title"], "with own poses" if self.own else f"first poses of {partners} other windows"]

@@ -15,7 +15,7 @@ def occlude(motion: MotionSet, share: float = 0.2, length: float = 15.0, seed: i
     Every joint of every clip except the root is missing or observed according to its own Markov chain (Gilbert, 1960).
     A burst continues from one frame to the next with probability 1 - 1 / length, so its length is geometric. Bursts
     begin with the probability that makes `share` the expected proportion of missing frames, from the first frame on.
-    The root is never missing, because positions relative to it would be missing too.
+    The root is never missing, because all positions relative to it would then be missing too.
 
     Args:
         motion: clips.
@@ -29,8 +29,8 @@ def occlude(motion: MotionSet, share: float = 0.2, length: float = 15.0, seed: i
     begin = share / (1 - share) / length if 0 <= share < 1 <= length else np.nan
     if not 0 <= begin <= 1:
         raise ValueError(
-            "expected a share from 0 to below 1 and bursts of at least max(1, share / (1 - share)) frames, got "
-            f"{share} and {length}"
+            "`share` must be at least 0 and below 1, and `length` at least max(1, share / (1 - share)) frames; got "
+            f"share={share} and length={length}"
         )
 
     clips, root = [], motion.skeleton.root

@@ -9,9 +9,9 @@ Decisions where papers and code differ:
   below F - T, so it never uses a clip's last frame and drops clips of exactly T frames.
 * Validation clips are every k-th training clip in file order. Whole clips are chosen because the windows of a clip
   overlap. They are chosen before clips that are too short are dropped, so they are the same for every window length. In
-  bandai2, neighbouring takes are near copies and all validation takes have seen styles, so validation there does not
-  replace the test.
-* References that memorise the training data (nearest neighbours) should memorise all of it: `"train+validation"`.
+  bandai2, neighbouring takes are near copies, and the style of every validation take also occurs in training.
+  Validation scores there cannot replace test scores.
+* Baselines that memorise the training data (nearest neighbours) should use all of it, the split "train+validation".
 """
 
 from __future__ import annotations
@@ -51,18 +51,21 @@ class Protocol:
     Args:
         name: name in results.
         observed, predicted: number of observed and of predicted frames; a window contains both.
-        fps: frames per second that the numbers of frames refer to.
-        train_stride, test_stride: frames between the starts of listed training and test windows.
-        root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1). "relative":
-            relative to the pelvis in the first frame of the window that has it, D = 3 J; global motion is kept.
-        multimodal_threshold: metres; test windows whose last observed poses are closer than this share their futures.
+        fps: frames per second that the motion must have.
+        train_stride, test_stride: frames between the starts of successive windows, where windows are listed and not
+            drawn, for training and for test.
+        root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1). "relative": all
+            frames are relative to one position, the pelvis in the first frame of the window in which it was observed.
+            Global motion is then kept, and D = 3 J.
+        multimodal_threshold: distance in metres. If the last observed poses of test windows are closer than this, the
+            futures of all these windows are possible futures of each.
         split_by: "split", or the label that assigns clips to splits.
         train, test: values of `split_by` for training and test.
         validation: fraction of the training clips held out for validation.
         sampling: distribution of training windows. "clip": uniform clip, uniform start. "length": uniform over all
             windows. "subject": uniform split of the archive (a subject, in Human3.6M), then clip, then start.
         heading: rotate every window about the up axis so that the heading of its last observed frame is zero.
-        rotate: rotate every drawn window about the up axis by a uniform random angle.
+        rotate: rotate every window that `Windows.sample` draws about the up axis by a uniform random angle.
         representation: input of the models: positions, or joint rotations in one of the forms of
             `dvae.motion.geometry.rotations`. Windows and scores use positions in either case.
 
@@ -93,7 +96,9 @@ class Protocol:
         except (TypeError, ValueError) as error:
             raise type(error)(f"protocol {self.name}: {error}") from None
         if self.heading and self.rotate:
-            raise ValueError(f"protocol {self.name}: heading fixes the direction that rotate would draw; choose one")
+            raise ValueError(
+                f"protocol {self.name}: `heading` fixes the direction that `rotate` draws at random; set only one"
+            )
 
     @property
     def length(self) -> int:
@@ -183,7 +188,7 @@ class Poses(Schema):
         if (actual := schema.protocol.representation) != representation:
             raise SchemaError(
                 f"{who} reads {_describe(representation)}, but under this protocol models see {_describe(actual)}; "
-                f"choose one whose representation is {representation} (--representation)"
+                f"choose a protocol whose representation is {representation} (--representation)"
             )
         return schema
 
@@ -239,15 +244,15 @@ def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int
         length: frames in a window; default: the protocol's observed + predicted.
 
     Raises:
-        ValueError: the frame rates differ, the split has no clip, no clip is long enough, or a clip has no label
-            although the protocol splits by it.
+        ValueError: motion and protocol have different frame rates, the split has no clip, no clip is long enough, or a
+            clip has no label although the protocol splits by it.
     """
     if isinstance(protocol, str):
         protocol = named_protocol(protocol)
     if motion.skeleton.fps != protocol.fps:
         raise ValueError(
             f"protocol {protocol.name} needs {protocol.fps:g} frames per second, but {motion.name!r} has "
-            f"{motion.skeleton.fps:g}: choose another protocol or make one with dataclasses.replace"
+            f"{motion.skeleton.fps:g}; resample the motion with `MotionSet.resampled`, or choose another protocol"
         )
     parts = _divide(motion, protocol)
     unknown = [name for name in split.split("+") if name not in parts]
@@ -290,7 +295,7 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
 def held_out(count: int, part: float) -> set[int]:
     """Return the indices of the clips held out for validation.
 
-    The clips are divided into one block per clip to hold out, and the middle of each block is held out.
+    The clips are divided into as many blocks as there are clips to hold out. The middle clip of each block is held out.
     """
     blocks = round(count * part)
     if part and count > 1:
@@ -306,7 +311,9 @@ class Windows:
     they are cut.
 
     Attributes:
-        protocol, skeleton, split: as given.
+        protocol: protocol that cuts the windows.
+        skeleton: skeleton of the poses.
+        split: split of the windows.
         length: number of frames T in a window.
         missing: whether joints may be missing.
         clips: clips that are long enough.
@@ -315,7 +322,9 @@ class Windows:
 
     def __init__(self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int) -> None:
         if length < 1 or (protocol.heading and length < protocol.observed):
-            raise ValueError(f"windows of {length} frames: expected at least {protocol.observed} (the observed frames)")
+            raise ValueError(
+                f"`length` must be at least {protocol.observed if protocol.heading else 1} frames, got {length}"
+            )
         source = motion if protocol.representation == "positions" else motion.with_rotations()
         self.protocol, self.skeleton, self.split, self.length = protocol, source.skeleton, split, length
         self.missing, self._rest = motion.missing, motion.skeleton.rest
@@ -346,8 +355,8 @@ class Windows:
             self._usable_before = torch.from_numpy(before)  # number of usable frames before each frame
             if not len(self):
                 raise ValueError(
-                    f"{split} split of {motion.name!r} has no window with the root and another joint present in some "
-                    "observed and in some predicted frame"
+                    f"{split} split of {motion.name!r} has no usable window: the root and another joint must be "
+                    "observed together in at least one observed and one predicted frame"
                 )
         self._weights = self._draw_weights().cumsum(0)
 
@@ -361,7 +370,7 @@ class Windows:
 
     @property
     def stride(self) -> int:
-        """Frames between listed windows; validation windows use the stride of test windows."""
+        """Frames between the starts of the windows in `keys`; validation windows use the stride of test windows."""
         return self.protocol.train_stride if self.split.startswith("train") else self.protocol.test_stride
 
     @property
@@ -417,9 +426,9 @@ class Windows:
         """Return the windows that start at multiples of `stride`, in the order of `keys`: {"x": (N, T, D)} float32.
 
         If joints may be missing, the batch also contains "mask" (N, T, D), which is False where a value is missing; x
-        is 0 there. Poses are relative to the root, so a whole frame is missing if its root is. With root="relative",
-        values are missing only if the root is missing throughout the window. Listed are windows with observed values
-        both in the observed and in the predicted frames.
+        is 0 there. Poses are relative to the root, so a whole frame is missing if its root is. With root="relative", a
+        missing root affects other joints only if it is missing throughout the window. Only windows that have observed
+        values in both the observed and the predicted frames are listed.
         """
         return self._cut_batch(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
 
@@ -440,7 +449,7 @@ class Windows:
         return batch
 
     def poses(self) -> Tensor:
-        """Return every frame of the clips once, as the first frame of a window has it: (N, D) float32.
+        """Return every frame of the clips once, (N, D) float32, represented like the first frame of a window.
 
         Frames with missing joints are left out.
         """
@@ -456,7 +465,7 @@ class Windows:
         """
         if not any(name in clip.labels for clip in self.clips):
             names = sorted({label for clip in self.clips for label in clip.labels})
-            raise KeyError(f"no label {name!r}; there are {', '.join(names) or 'none'}")
+            raise KeyError(f"no clip has the label {name!r}; the labels are {', '.join(names) or 'none'}")
         return [self.clips[c].labels.get(name, "") for c in self._list(self.stride)[0].tolist()]
 
     def classified(self, variable: str, label: str, classes: Sequence[str]) -> Windows:
@@ -464,7 +473,7 @@ class Windows:
 
         Args:
             variable: name in batches.
-            label: label of the clips that is the class.
+            label: name of the clip label that gives the class.
             classes: possible values of the label.
 
         Raises:
@@ -489,8 +498,8 @@ class Windows:
         """
         if x.shape[-1] != self.size:
             raise ValueError(
-                f"frames have {x.shape[-1]} numbers, expected {self.size}: {self.skeleton.joints} joints, "
-                f"root {self.protocol.root}"
+                f"frames have {x.shape[-1]} numbers, expected {self.size} for {self.skeleton.joints} joints "
+                f"and root={self.protocol.root!r}"
             )
         return self.skeleton.with_root(x.unflatten(-1, (-1, 3)))
 
@@ -537,7 +546,7 @@ class Windows:
         return positions + roots.take_along_dim(is_known.all(-1).byte().argmax(1, keepdim=True)[..., None], 1)
 
     def given(self, joints: Sequence[str] | float) -> Windows:
-        """Return these windows with trajectories in their batches: {"y": (B, T, D)}, x at given joints and 0 at others.
+        """Return these windows with trajectories in their batches: {"y": (B, T, D)}, x at given joints, 0 elsewhere.
 
         Args:
             joints: names of the given joints, as in `Skeleton.find`; or the probability that a joint is given in a
@@ -556,7 +565,10 @@ class Windows:
             raise ValueError(f"joints must be a list of names, such as [{joints!r}]")
         names = {self.skeleton.names[self.skeleton.find(joint)] for joint in joints}
         if dropped := names - set(self.joints):
-            raise ValueError(f"the protocol {self.protocol.name} drops {dropped.pop()}")
+            raise ValueError(
+                f"the joint {dropped.pop()} cannot be given, because the protocol {self.protocol.name} drops the root; "
+                "choose other joints, or a protocol with root='relative'"
+            )
         windows._given = torch.tensor([float(name in names) for name in self.joints])
         return windows
 
@@ -578,7 +590,7 @@ class Windows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Entries for a record: the joints, and those whose paths are given."""
+        """Names of all joints and of the joints whose paths are given, for the record of an evaluation."""
         description: dict[str, Any] = {"joints": list(self.skeleton.names), "title": [], "called": ["clip", "frame"]}
         if (given := self.given_joints) is not None:
             description |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
@@ -658,7 +670,7 @@ class Windows:
         return self._represent(cut_windows(self._frames, clips, starts, self.length), self.protocol.observed - 1)
 
     def _represent(self, joints: Tensor, now: int) -> Tensor:
-        """Return frames (B, T, D) of joints (B, T, J, 3); a fixed heading is zero in frame `now`."""
+        """Return frames (B, T, D) of joints (B, T, J, 3); if headings are fixed, frame `now` has heading zero."""
         root = self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, now)[:, None, None]

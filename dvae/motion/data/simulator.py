@@ -19,13 +19,16 @@ ACTIVITIES = ("stand", "walk", "wave-left", "wave-right", "wave-both", "turn-lef
 """The activities in the order of the codes in a clip's truth."""
 
 SHORTEST, MEAN_EXTRA = 0.7, 1.0
-"""Seconds: the duration of an activity is the first plus an exponential time whose mean is the second."""
+"""Duration of an activity in seconds: `SHORTEST` plus an exponential time with mean `MEAN_EXTRA`."""
 
 BLEND = 0.45
 """Duration in seconds of the transition between activities."""
 
 SETTLE = 0.4
-"""Seconds of smoothing between feet and pelvis: shorter shakes the body at each step, longer lets the feet slide."""
+"""Duration in seconds of the smoothing that lets the pelvis follow the feet.
+
+A shorter duration shakes the body at each step; a longer one lets the feet slide.
+"""
 
 _J = {name: joint for joint, name in enumerate(WALKER.names)}
 
@@ -58,19 +61,22 @@ def simulate(clips: int = 64, frames: int = 150, seed: int = 0, test: float = 0.
         clips: number of people, one clip each.
         frames: length of a clip.
         seed: random seed.
-        test: fraction of the clips, the last ones, in split "test"; the others are in "train".
+        test: fraction of the clips that form the split "test", the last ones; the other clips form "train".
 
     Returns:
-        A `MotionSet`. Labels of a clip: `activity` (its first), `switches` ("walk@0 wave-left@41": activity
-        and first frame of each), `height_m`, `cadence_hz`. Truth of a clip: `activity` (F,) codes into
-        `ACTIVITIES`, `weights` (F, 7) of the activities while they blend, `phase` (F,) of the gait and
-        `heading` (F,) in radians, `bone_lengths` (16,) in metres, `style` (7,).
+        A `MotionSet`. Labels of a clip: `activity` (its first activity), `switches` ("walk@0 wave-left@41": activity
+        and first frame of each), `height_m`, `cadence_hz`. Truth of a clip: `activity` (F,) codes into `ACTIVITIES`,
+        `weights` (F, 7) of the activities while they blend, `phase` (F,) of the gait and `heading` (F,) in radians,
+        `bone_lengths` (16,) in metres, `style` (7,).
 
     Raises:
         ValueError: fewer than 1 clip or 2 frames, or a test fraction outside 0 to 1.
     """
     if clips < 1 or frames < 2 or not 0 <= test <= 1:
-        raise ValueError(f"cannot simulate {clips} clips of {frames} frames with a share of {test} for test")
+        raise ValueError(
+            "expected at least 1 clip, at least 2 frames and a test fraction from 0 to 1, got "
+            f"clips={clips}, frames={frames} and test={test}"
+        )
     random = np.random.default_rng(seed)
     offsets = _morphology(random, clips)
     style = _style(random, clips)
@@ -170,7 +176,7 @@ def _phase(random: np.random.Generator, weights: np.ndarray, style: np.ndarray) 
 
 
 def _heading(random: np.random.Generator, weights: np.ndarray) -> np.ndarray:
-    """Return the heading (N, F) in radians: turns at a personal rate, and slow drift while walking."""
+    """Return the heading (N, F) in radians: a turning rate for each person, and slow drift while walking."""
     clips, frames = weights.shape[:2]
     rate = random.uniform(1.0, 2.2, (clips, 1)) * (_of(weights, "turn-left") - _of(weights, "turn-right"))
     rate = rate + 0.15 * _drift(random, clips, frames) * _of(weights, "walk")

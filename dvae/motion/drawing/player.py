@@ -1,8 +1,9 @@
 """Interactive animations of skeletons in HTML pages and notebooks, small and without a library: play, seek, rotate.
 
-A scene is stored as integers in millimetres: the observed frames, which all people share, then the future of each, as
-differences between frames. A missing joint is stored as `MISSING`. Of these 16-bit numbers, first all low bytes and
-then all high bytes are deflated and encoded in base64: 50 futures of a window take about 100 kB.
+A scene is stored as integers in millimetres: the observed frames, which all people share, then the future of each
+person. Frames are stored as differences from the previous frame, and a missing joint has the coordinate `MISSING`.
+First all low bytes and then all high bytes of these 16-bit integers are deflated and encoded in base64. In this form,
+50 futures of a window take about 100 kB.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
 MILLIMETRE = 1e-3
 
 MISSING = -32768
-"""Replaces unknown coordinates."""
+"""Integer that stands for an unknown coordinate."""
 
 _PLAYER = Markup(
     '<div class="player" data-motion="{motion}">'
@@ -87,7 +88,10 @@ def _scene(stage: Scene) -> dict[str, Any]:
 
 
 def _pack(steps: np.ndarray) -> str:
-    """Encode integers modulo 2^16; sums of differences are still correct."""
+    """Encode integers modulo 2^16 in base64.
+
+    Differences between frames may exceed 16 bits, but their sums modulo 2^16 are the original coordinates.
+    """
     planes = steps.astype(np.int64).astype("<u2").view(np.uint8).reshape(-1, 2).T
     return base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode()
 
@@ -107,13 +111,13 @@ class Animation:
     title: str = ""
 
     def to_html(self) -> str:
-        """Return the page, which loads nothing and runs only the player's script."""
+        """Return an HTML page that loads no other files and runs only the player's script."""
         allowed = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
         moving = player({self.title or "motion": self.scene})
         return str(_PAGE.format(title=self.title, policy=allowed, player=moving, script=Markup(SCRIPT)))
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the page to a file."""
+        """Write the HTML page of `to_html` to a file."""
         with files.atomic_write(path) as file:
             file.write(self.to_html().encode())
 
@@ -191,7 +195,8 @@ def animate(
     Args:
         skeleton: skeleton of the poses.
         observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
-        samples: (K, H, J, 3) in metres; without them, only the observed motion is shown, from time zero.
+        samples: (K, H, J, 3) in metres. Without samples, only the observed motion is shown, and time zero is its first
+            pose.
         truth: (F, J, 3) in metres, if known; F is at most H.
         names: names of the K samples; default: numbers.
         fixed: joints that move in the same way in all samples; bones that end in them are dark and thick.

@@ -41,10 +41,10 @@ def pose(
     """Draw poses, (J, 3) or several at once (..., J, 3), seen from the front of a person with heading zero.
 
     Args:
-        ax: axes in metres.
-        positions: metres, numpy or torch.
+        ax: axes to draw on; their units are metres.
+        positions: (..., J, 3) in metres, numpy or torch.
         skeleton: skeleton of the poses.
-        at: offset of the horizontal and vertical coordinates of the drawing.
+        at: horizontal and vertical offset of the drawing in metres.
         azimuth: rotation of the people about the up axis in radians.
         **line: options of matplotlib's LineCollection, such as colors, linewidths, alpha.
     """
@@ -78,8 +78,8 @@ def futures(
 
     The past is black, the truth green, and each sample keeps its own colour over time. Every pose is drawn relative to
     its pelvis. All poses are seen from the same side: the last observed pose is seen from the front, rotated by `view`.
-    If paths of joints were given, they are drawn as crosses, and all poses of a frame are relative to the mean of the
-    samples' pelvises.
+    With `paths`, poses after the last observed one are not centred one by one: all poses of a frame are drawn relative
+    to the mean pelvis position of the samples, and the paths are drawn as crosses.
 
     Args:
         skeleton: skeleton of the poses.
@@ -89,7 +89,8 @@ def futures(
         frames: number of future frames to draw; the last one is always included.
         ax: axes; default: a new figure.
         view: angle in radians between the last observed heading and the viewer.
-        paths: mapping from joint to its given path (H, 3) in metres; NaN where unknown.
+        paths: dictionary from joint name to a path (H, 3) in metres that the samples were conditioned on; NaN where
+            unknown.
 
     Returns:
         The axes; `ax.figure.savefig(...)` saves them.
@@ -141,8 +142,9 @@ class Scene:
     Attributes:
         skeleton: skeleton of all people.
         names: names of the P people; the truth, if any, is the first.
-        colours: colour of each, from `now` on.
-        motion: (P, O + H, J, 3), each about its own origin; NaN after the end of a truth that ends early.
+        colours: colour of each person after frame `now`.
+        motion: (P, O + H, J, 3) in metres, without the offsets of `places`; NaN after the end of a truth that ends
+            early.
         now: index of the last observed frame.
         frames: indices of the frames to show, including `now`.
         fixed: joints that move in the same way in all samples.
@@ -160,30 +162,30 @@ class Scene:
 
     @property
     def low(self) -> np.ndarray:
-        """(3,), minimum coordinates of all people."""
+        """(3,), minimum coordinates over all people, frames and joints, in metres."""
         return np.nanmin(self.motion, (0, 1, 2))  # type: ignore[no-any-return]
 
     @property
     def high(self) -> np.ndarray:
-        """(3,), maximum coordinates of all people."""
+        """(3,), maximum coordinates over all people, frames and joints, in metres."""
         return np.nanmax(self.motion, (0, 1, 2))  # type: ignore[no-any-return]
 
     @property
     def places(self) -> np.ndarray:
-        """(P, 3), positions of the people, so that they do not overlap."""
+        """(P, 3), offset of each person in metres, so that people do not overlap."""
         return _places(len(self.motion), np.maximum(self.high - self.low + 0.4, SPACING))
 
     @property
     def milliseconds(self) -> float:
-        """Time between shown frames, at original speed."""
+        """Time between shown frames in milliseconds, at original speed."""
         return 1000 * self.frames.step / self.skeleton.fps
 
     def seconds(self, frame: int) -> float:
-        """Return the time of a frame relative to the last observed frame."""
+        """Return the time in seconds of a frame relative to the last observed frame."""
         return (frame - self.now) / self.skeleton.fps
 
     def shared(self, person: int) -> frozenset[int]:
-        """Return the joints of a person that move in the same way in all other samples."""
+        """Return the joints of a person that move in the same way in all samples; none for the truth."""
         return frozenset() if self.truth and person == 0 else self.fixed
 
 
@@ -227,7 +229,13 @@ def make_scene(
 
 
 def _add_legend(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
-    """Add a legend of the colours of `futures`, below the times."""
+    """Add a legend of the colours of `futures` below the labels of time.
+
+    Args:
+        ax: axes of `futures`.
+        samples: number of samples.
+        truth, paths: whether the truth and given paths were drawn.
+    """
     sampled = tuple(Line2D([], [], color=colour) for colour in _colours(min(samples, 5)))
     key: dict[str, Any] = {"observed": Line2D([], [], color=PAST)}
     if truth:
@@ -251,7 +259,7 @@ def _add_legend(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
 def _to_viewer(
     skeleton: Skeleton, past: np.ndarray, futures: Sequence[np.ndarray], horizon: int, view: float
 ) -> np.ndarray:
-    """Return motions (P, O + H, J, 3) in the viewer's coordinates, with z up."""
+    """Return motions (P, O + H, J, 3) of the observed past and P futures in the viewer's coordinates, with z up."""
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
     for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which is not drawn
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
@@ -269,29 +277,31 @@ def _places(people: int, step: np.ndarray) -> np.ndarray:
 
 
 def _colours(samples: int) -> np.ndarray:
-    """Return a colour for each sample, (K, 4)."""
+    """Return a colour (RGBA) for each sample, (K, 4)."""
     return plt.get_cmap("turbo")(np.linspace(0.05, 0.95, samples))
 
 
 def final_heading(skeleton: Skeleton, positions: Tensor) -> float:
-    """Return the heading at the end of motion (F, J, 3); zero if the skeleton does not define left and right."""
+    """Return the heading in radians at the end of motion (F, J, 3); 0 if the skeleton has no left and right side."""
     return float(skeleton.heading_near(positions, len(positions) - 1)) if skeleton.left and skeleton.right else 0.0
 
 
 def _path_array(paths: Mapping[str, Any], skeleton: Skeleton, horizon: int) -> np.ndarray:
-    """Return the paths of some joints (paths, H, 3)."""
+    """Return the paths of joints as an array (paths, H, 3), or raise an error if a joint or shape is wrong."""
     arrays = {joint: np.asarray(path, np.float64) for joint, path in paths.items()}
     for joint, path in arrays.items():
         skeleton.find(joint)  # raises an error for an unknown joint
         if path.shape != (horizon, 3):
-            raise ValueError(f"expected a path ({horizon}, 3) of {joint}, as long as the samples; got {path.shape}")
+            raise ValueError(
+                f"the path of {joint} has shape {path.shape}, expected ({horizon}, 3), as long as the samples"
+            )
     return np.array([*arrays.values()]).reshape(-1, horizon, 3)
 
 
 def _as_arrays(
     skeleton: Skeleton, observed: Any, samples: Any, truth: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return observed motion, samples and truth as arrays of matching shapes."""
+    """Return observed motion, samples and truth as arrays, or raise an error if their shapes do not match."""
     past, future = np.asarray(observed, np.float64), np.asarray(samples, np.float64)
     real = None if truth is None else np.asarray(truth, np.float64)
     joint = (skeleton.joints, 3)
@@ -299,8 +309,8 @@ def _as_arrays(
     truth_fits = real is None or (real.ndim == 3 and real.shape[1:] == joint and len(real) <= future.shape[1])
     if not (samples_fit and truth_fits and past.size and future.size):
         raise ValueError(
-            f"expected observed (O, J, 3), samples (K, H, J, 3) and truth (up to H, J, 3) with J = {joint[0]}, "
-            f"got {past.shape}, {future.shape} and {None if real is None else real.shape}"
+            f"expected observed (O, J, 3), samples (K, H, J, 3) and truth (F, J, 3) with J = {joint[0]} and F at most "
+            f"H, got {past.shape}, {future.shape} and {None if real is None else real.shape}"
         )
     return past, future, real
 
@@ -309,14 +319,14 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
     """Draw bodies next to each other, seen from the front of a person with heading zero.
 
     Args:
-        faces: (F, 3), triangles.
+        faces: (F, 3), vertex indices of triangles.
         vertices: (V, 3) for one pose, or (P, V, 3) for P bodies or poses, in metres, numpy or torch without gradients.
         names: names of the bodies; default: no names.
         up: vertical axis, "y" or "z".
         title: title of the figure.
 
     Returns:
-        A figure in metres.
+        A figure whose axes are in metres.
 
     Raises:
         ValueError: the shapes do not match each other, a position is not finite, or the number of names is wrong.
@@ -351,7 +361,12 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
 
 
 def _mesh(faces: np.ndarray, places: np.ndarray) -> PolyCollection:
-    """Return the triangles of a mesh (V, 3) that face the viewer, shaded by the light, the nearest last."""
+    """Return the triangles that face the viewer, shaded by the light; the nearest is drawn last.
+
+    Args:
+        faces: (F, 3), vertex indices of triangles.
+        places: (V, 3), vertices in the viewer's coordinates.
+    """
     first, second, third = places[faces].swapaxes(0, 1)
     normals = np.cross(second - first, third - first)
     smooth = np.zeros_like(places)

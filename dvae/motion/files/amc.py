@@ -3,9 +3,9 @@
 A bone of an ASF file has a direction, a length and its own axes. The rows of an AMC file rotate it about these axes, by
 C M C^-1 relative to its parent. C is the matrix of its axes, and M the rotation in the row, with the first angle
 applied first. Here a joint is at the start of its bone and has the name of the bone. An additional joint is at the end
-of each last bone.
+of each bone without children.
 
-If the file contains `length 0.45`, a unit is 1 / (45/100) inch (frequently asked questions of mocap.cs.cmu.edu).
+If the file contains `length 0.45`, a unit is 1 / 0.45 inch (frequently asked questions of mocap.cs.cmu.edu).
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Bone:
-    """One bone: name of its parent, vector in the unit of the file, axes (3, 3), and axes of its rotations."""
+    """One bone: name of its parent, vector from start to end in the unit of the file, own axes (3, 3), rotation axes.
+
+    The rotation axes are letters in the order of the channels, such as "zx".
+    """
 
     parent: str
     vector: Vector
@@ -41,7 +44,7 @@ class Bone:
 
 
 def joints_of(bones: Mapping[str, Bone]) -> tuple[list[str], list[int], np.ndarray]:
-    """Return names, parents and offsets (J, 3) of the joints at bone starts and at the last ends, depth first."""
+    """Return names, parents and offsets (J, 3) of joints: starts of bones and ends of childless bones, depth first."""
     below: dict[str, list[str]] = {"root": []}
     for name, bone in bones.items():
         below[name] = []
@@ -107,7 +110,7 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
     bones = {}
     for name in _bones_in_order(path, parent_of):
         if name not in sections:
-            raise ValueError(f"{path}: the hierarchy has {name[:60]!r}, which is not a bone")
+            raise ValueError(f"{path}: the hierarchy has {name[:60]!r}, which :bonedata does not define")
         bone = sections[name]
         length = values(bone["length"], 1, f"length of {name}")[0]
         direction = length * values(bone["direction"], 3, f"direction of {name}")
@@ -118,16 +121,17 @@ def read_asf(path: str | Path) -> tuple[dict[str, Bone], float, bool, str]:
         )
         if len(free_axes) != len(bone.get("dof", [])) or sorted(order) != ["x", "y", "z"]:
             raise ValueError(
-                f"{path}: {name} has axes {order!r} and rotations {bone.get('dof')}, expected rx, ry or rz"
+                f"{path}: {name} has axis order {order!r} and dof {bone.get('dof')}; expected an order such as "
+                "xyz, and a dof of rx, ry and rz"
             )
         axes = _rotation(torch.from_numpy(np.deg2rad(angles) if degrees else angles), order)
         bones[name] = Bone(parent_of[name], tuple(direction.tolist()), axes, free_axes)
     unit = values(settings.get("length", ["1"]), 1, "length")[0]
     if not 1e-6 < unit < 1e6:
-        raise ValueError(f"{path}: length {unit:g}, expected a positive ratio of the unit to an inch")
+        raise ValueError(f"{path}: length is {unit:g}, expected a positive number of units per inch")
     order = " ".join(settings.get("order", ["TX", "TY", "TZ", "RX", "RY", "RZ"])).lower()
     if sorted(order.split()) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
-        raise ValueError(f"{path}: the root's order is {order[:60]!r}, expected TX to RZ once each")
+        raise ValueError(f"{path}: the root's order is {order[:60]!r}, expected TX, TY, TZ, RX, RY and RZ, once each")
     return bones, INCH / unit, degrees, order
 
 
@@ -139,7 +143,8 @@ def read_amc(path: str | Path) -> Recording:
 
     Raises:
         FileNotFoundError: the file does not exist, or its folder has no matching ASF file.
-        ValueError: the file is not AMC, is damaged, or has another skeleton; the message contains the frame.
+        ValueError: the file is not AMC, is damaged, or does not match the skeleton; the message contains the frame or
+            line.
     """
     path = Path(path)
     skeleton = _skeleton_of(path)
@@ -157,20 +162,20 @@ def read_amc(path: str | Path) -> Recording:
         elif len(words) == 1 and words[0].isdecimal():
             short = [name for name, rows in values.items() if len(rows) != frames * columns[name]]
             if short:
-                raise ValueError(f"{path}: frame {frames} has no row for {short[0]}, of {skeleton}")
+                raise ValueError(f"{path}: frame {frames} has no row for the bone {short[0]} of {skeleton}")
             frames += 1
             check_size(path, frames, len(names))
         elif len(words) - 1 != columns.get(words[0]) or len(values[words[0]]) != (frames - 1) * columns[words[0]]:
             raise ValueError(
-                f"{path}: line {number} is {line.strip()[:60]!r}, expected one row a frame for each bone of "
-                f"{skeleton}, with an angle for each of its rotation axes"
+                f"{path}: line {number} is {line.strip()[:60]!r}, expected one row per frame for each bone "
+                f"of {skeleton}, with one number per channel of the bone"
             )
         else:
             values[words[0]] += words[1:]
     angles_of = {}
     for name, count in columns.items():
         if not frames or len(values[name]) != frames * count:
-            raise ValueError(f"{path}: frame {frames} has no row for {name}, of {skeleton}")
+            raise ValueError(f"{path}: frame {frames} has no row for the bone {name} of {skeleton}")
         angles_of[name] = torch.from_numpy(numbers(" ".join(values[name]), f"{path}: {name}").reshape(frames, count))
     channels = order.split()
     root = angles_of["root"]
@@ -224,15 +229,16 @@ SUBJECT_02 = {
     "rthumb": ("rwrist", -0.59786, 0, 0.59786),
     "rfingers": ("rhand", -0.58887, 0, 0),
 }
-"""Parents and vectors of the bones of CMU's subject 02 in 1 / .45 inch; the benchmark gives this body to everybody."""
+"""Parents and vectors of the bones of CMU's subject 02 in 1 / .45 inch; the benchmark uses it for all people."""
 
 
 def read_expmap(path: str | Path) -> Recording:
     """Read exponential maps as in the CMU benchmark: rows of 117 numbers per frame, positions and rotation vectors.
 
-    The vectors in the file act on rows; they are negated here. The first row is a rest pose, not a frame, and is left
-    out. The root rotation in the file composes the angles of the AMC file in the wrong order (z x y instead of z y x).
-    This tilts people who face away from +z. The angles are extracted and composed again in the right order.
+    The rotation vectors in the file are for row vectors, so their sign is reversed here. The first row is a rest pose,
+    not a frame, and is left out. The root rotation in the file composes the angles of the AMC file in the wrong order
+    (z x y instead of z y x). This tilts people who face away from +z. The angles are extracted and composed again in
+    the right order.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -246,7 +252,7 @@ def read_expmap(path: str | Path) -> Recording:
     rows, remainder = divmod(len(values), 3 + 3 * len(names))
     if remainder or rows < 2:
         raise ValueError(
-            f"{path}: got {len(values):,} numbers, expected rows of {3 + 3 * len(names)}, the first row a pose at rest"
+            f"{path}: got {len(values):,} numbers, expected two or more rows of {3 + 3 * len(names)}, first a rest pose"
         )
     check_size(path, rows, len(names))
     vectors = torch.from_numpy(values).reshape(rows, -1, 3)[1:]
@@ -287,6 +293,7 @@ def _skeleton_of(path: Path) -> Path:
     matching = [file for file in candidates if path.stem.startswith(file.stem)]
     if len(matching or candidates) != 1:
         raise FileNotFoundError(
-            f"{path}: which skeleton? Expected its ASF file in the same folder, such as 02.asf for 02_01.amc"
+            f"{path}: cannot choose its skeleton among {len(matching or candidates)} ASF files in the folder; expected "
+            "one whose name begins the name of the AMC file, such as 02.asf for 02_01.amc"
         )
     return (matching or candidates)[0]

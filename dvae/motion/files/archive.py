@@ -1,9 +1,8 @@
 """Safe reading of untrusted npz archives.
 
-Everything in an archive is checked before it is used, and no native object is created from it directly. Headers
-(`dvae.data.npy`) and pickles are parsed by few rules into names, shapes and bytes. If these are consistent, arrays are
-created from the bytes. numpy's own readers evaluate headers, and fill arrays and dtypes with whatever a pickle
-contains.
+Everything in an archive is checked before it is used. Small parsers read headers (`dvae.data.npy`) and pickles as
+names, shapes and bytes. If these are consistent, arrays are created from the bytes. numpy's own readers are not used,
+because they evaluate headers, and fill arrays and dtypes with whatever a pickle contains.
 """
 
 from __future__ import annotations
@@ -97,8 +96,8 @@ def _limit(size: int) -> int:
 def write_arrays(file: BinaryIO, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
     """Write an npz that `archive` reads.
 
-    It is compressed unless it is large enough to be mapped, or its compression ratio is above the limit for reading, as
-    for motion that hardly moves.
+    The file is not compressed if it is large enough to be memory-mapped, or if it would compress more than `archive`
+    accepts. Motion that hardly moves compresses that much.
 
     Args:
         file: new file, open for writing and reading.
@@ -131,9 +130,11 @@ def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Membe
     unpacked, limit = sum(info.file_size for info in infos if info.filename not in arrays), _limit(size)
     if unpacked > limit:
         addition = f" in addition to {len(arrays)} arrays that are mapped" if arrays else ""
-        raise NpyError(f"it would unpack to {unpacked:,} bytes{addition}, at most {limit:,} are read from {size:,}")
+        raise NpyError(
+            f"it would unpack to {unpacked:,} bytes{addition}; at most {limit:,} are allowed for a file of {size:,}"
+        )
     if sum(info.compress_size for info in infos) > size:
-        raise NpyError("damaged: its members take more bytes than it has")
+        raise NpyError("damaged: its members have more bytes than the file")
     members = {}
     for info in infos:
         name = info.filename.removesuffix(".npy")
@@ -141,13 +142,13 @@ def _members(file: zipfile.ZipFile, size: int, mapping: bool) -> dict[str, Membe
             raise NpyError(f"{name} is encrypted; write the archive without a password")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             method = {9: "deflate64", 12: "bzip2", 14: "LZMA", 93: "zstd", 95: "xz"}.get(
-                info.compress_type, "another way"
+                info.compress_type, "another method"
             )
             raise NpyError(
                 f"{name} is compressed by {method}, expected deflate or none; write it with np.savez_compressed"
             )
         if not is_name(name):
-            raise NpyError(f"{name[:40]!r} is not a name of a split and a clip")
+            raise NpyError(f"{name[:40]!r} is not a valid name; expected at most 1000 printable characters")
         if name in members:
             raise NpyError(f"{name} occurs twice")
         members[name] = Member(name, file, info, arrays.get(info.filename))
@@ -193,7 +194,7 @@ class _Stream:
 
     def read(self, size: int) -> bytes:
         if size > self.left:
-            raise EOFError(f"{size:,} bytes are announced, but {self.left:,} are left")
+            raise EOFError(f"expected {size:,} more bytes, but only {self.left:,} are left")
         return self._count(self._buffered.read(size))
 
     def some(self, size: int) -> bytes:
@@ -221,7 +222,7 @@ class Member:
     """One npy file inside an npz.
 
     Args:
-        name: name without the ending.
+        name: name without the ending .npy.
     """
 
     name: str
@@ -245,7 +246,9 @@ class Member:
         with self._open() as stream:
             dtype, shape, order = header(stream.some)
             if dtype.hasobject:
-                raise NpyError("holds pickled objects, which only a member called positions_3d may")
+                raise NpyError(
+                    "contains pickled objects, which only a member called positions_3d may; save numbers or text"
+                )
             check_bytes(dtype, shape, stream.left)
             array = np.empty(shape, dtype, order)
             stream.readinto(array)
@@ -282,7 +285,9 @@ class Member:
                 clips_read.append((split, name, array.numbers()))
                 room -= array.numbers().nbytes
                 if room < 0:
-                    raise NpyError(f"{self.name}: its clips repeat one array, and have more bytes than the file")
+                    raise NpyError(
+                        f"{self.name}: its clips refer repeatedly to one array, and have more bytes than the file"
+                    )
         return clips_read
 
     @contextmanager
@@ -295,14 +300,14 @@ class Member:
 
 
 class _Global:
-    """A global name in a pickle, and a safe replacement for its call."""
+    """A function or class that a pickle names, and the safe function that is called in its place."""
 
     def __init__(self, name: str, call: Callable[..., Any] | None = None):
         self.name, self.call = name, call
 
 
 class _Type:
-    """A dtype under construction: a code, then its byte order."""
+    """A dtype under construction: created from its code; `build` then sets the byte order."""
 
     def __init__(self, dtype: np.dtype):
         self.dtype = dtype
@@ -312,12 +317,12 @@ class _Type:
         if not plain or state[1] not in ("<", ">", "|", "="):
             raise NpyError("refused a structured or custom dtype: expected numbers")
         if not _is_int(state[5]) or state[5] not in (-1, self.dtype.itemsize):
-            raise NpyError(f"refused a {self.dtype} that declares another size")
+            raise NpyError(f"refused a dtype {self.dtype} with a wrong item size")
         self.dtype = self.dtype.newbyteorder(state[1])
 
 
 class _Array:
-    """An array under construction: empty, then an array of numbers or text, or a shape and a list of objects."""
+    """An array under construction: empty at first; `build` fills it with numbers or text, or with a list of objects."""
 
     def __init__(self, array: np.ndarray | None = None):
         self._array = array
@@ -325,7 +330,7 @@ class _Array:
 
     def build(self, state: Any) -> None:
         if self._array is not None or not isinstance(state, tuple) or len(state) != 5:
-            raise NpyError("refused an array that is not made as numpy makes it")
+            raise NpyError("refused an array whose pickle differs from the format of numpy")
         _, shape, kind, fortran, content = state
         if not isinstance(kind, _Type):
             raise NpyError(f"refused an array whose dtype is a {_type_name(kind)}")
@@ -333,15 +338,15 @@ class _Array:
             self._array = _of_bytes(content, kind.dtype, shape, "F" if fortran is True or fortran == 1 else "C")
             return
         if not isinstance(content, list) or len(content) != prod(_shape(shape)):
-            raise NpyError(f"refused an array of objects of shape {_shape(shape)} with another number of objects")
+            raise NpyError(f"refused an array whose number of objects does not match its shape {_shape(shape)}")
         self._array, self._objects = np.empty((), object), content
 
     def item(self) -> Any:
-        """Return the content of an array of one object."""
+        """Return the object of an array with one object; otherwise return this array."""
         return self._objects[0] if self._objects and len(self._objects) == 1 else self
 
     def numbers(self) -> np.ndarray:
-        """Return the array, or an empty one for objects, which are not used."""
+        """Return the array of numbers or text; for objects, which are not used, return an empty array."""
         if self._array is None:
             raise NpyError("damaged pickle: an array has no content")
         return self._array
@@ -366,7 +371,7 @@ def _bytes(content: Any) -> bytes | bytearray:
     if isinstance(content, str):  # bytes of Python 2
         return content.encode("latin1")
     if not isinstance(content, bytes | bytearray):
-        raise NpyError(f"refused an array of a {_type_name(content)}: expected bytes")
+        raise NpyError(f"refused an array whose content has type {_type_name(content)}: expected bytes")
     return content
 
 
@@ -379,10 +384,10 @@ def _of_bytes(content: Any, dtype: np.dtype, shape: Any, order: Any) -> np.ndarr
 
 
 class _Interpreter:
-    """Interpret a pickle, and build dict, list, tuple, str, numbers and arrays; refuse every other global by name.
+    """Interpreter of pickles: builds dict, list, tuple, str, numbers and arrays, and refuses all other types by name.
 
-    A pickle can refer to a value again for two bytes. Such values are never copied, compared or traversed without
-    limit.
+    Two bytes of a pickle can refer to an earlier value, so a short pickle can describe a huge value. Repeated values
+    are therefore never copied, compared or traversed without limit.
 
     Args:
         room: maximum number of bytes of text and content passed to calls; repeated values count each time.
@@ -450,9 +455,9 @@ class _Interpreter:
             raise NpyError(f"refused to set items of a {_type_name(target)}")
         for key, value in zip(items[::2], items[1::2], strict=True):
             if not isinstance(key, str):  # only text is hashed or compared; other values could take forever
-                raise NpyError(f"refused a {_type_name(key)} as a key: splits and clips have names")
+                raise NpyError(f"refused a key of type {_type_name(key)}: splits and clips have names")
             if not is_name(key):
-                raise NpyError(f"refused the key {key[:40]!r}: splits and clips have names")
+                raise NpyError(f"refused the key {key[:40]!r}: names of splits and clips must be printable")
             target[key] = value
 
     def dictionary(self, _: Any) -> None:
@@ -483,7 +488,7 @@ class _Interpreter:
         if isinstance(arguments, tuple) and len(arguments) <= 8:
             self.room -= sum(len(value) for value in arguments if isinstance(value, str | bytes | bytearray))
         if self.room < 0 or not isinstance(arguments, tuple) or len(arguments) > 8:
-            raise NpyError("refused an array that is not made as numpy makes it")
+            raise NpyError("refused an array whose pickle differs from the format of numpy")
 
     def build(self, _: Any) -> None:
         state, target = self.stack.pop(), self.stack[-1]
@@ -497,7 +502,7 @@ def _reconstruct(subtype: Any, shape: Any, _code: Any) -> _Array:
     if not isinstance(subtype, _Global) or subtype.name != "numpy.ndarray":
         raise NpyError(f"refused an array of the class {_type_name(subtype)}")
     if _shape(shape) != (0,):  # numpy creates every array empty and fills it afterwards
-        raise NpyError(f"refused an array declared with shape {shape} before its content")
+        raise NpyError(f"refused an array created with shape {shape}: numpy pickles create it with shape (0,)")
     return _Array()
 
 
@@ -509,7 +514,7 @@ def _scalar(kind: Any, content: Any) -> Any:
 
 def _from_buffer(content: Any, kind: Any, shape: Any, order: Any, axes: Any = None) -> _Array:
     if not isinstance(kind, _Type) or kind.dtype.hasobject or order not in ("C", "F", "K"):
-        raise NpyError("refused an array that is not made as numpy makes it")
+        raise NpyError("refused an array whose pickle differs from the format of numpy")
     array = _of_bytes(content, kind.dtype, shape, "F" if order == "F" else "C")
     if order == "K" and axes is not None:
         array = array.transpose(_shape(axes))

@@ -37,7 +37,7 @@ WHICH = (
 )
 
 MOST_NUMBERS = 2**23
-"""Maximum number of values in a csv file of paths, with blank rows: a hundred thousand frames of twenty joints."""
+"""Maximum number of values in a csv file of paths, including blank rows: a hundred thousand frames of twenty joints."""
 
 _ARCHIVES = (
     ({f"S{i}" for i in (1, 5, 6, 7, 8, 9, 11)}, 32, HUMAN36M, HUMAN36M_KEPT),
@@ -70,7 +70,7 @@ def read_archive(
     file = Path(labels) if labels else companion(path, LABELS)
     labels_of = read_labels(file, labels)
     if labels_of and not any((split, name) in labels_of or (None, name) in labels_of for split, name, _, _ in unread):
-        raise ValueError(f"{file}: no row names a clip of {path} by (split, clip)")
+        raise ValueError(f"{file}: no row has the split and clip of a clip of {path}")
     unread.reverse()
 
     def clips() -> Iterator[Clip]:
@@ -83,7 +83,10 @@ def read_archive(
                 positions = metres * positions
             size += 0 if is_mapped(positions) else positions.nbytes
             if size > LARGEST:  # in a large mapped file, some arrays may have to be copied
-                raise ValueError(f"it has more than {LARGEST:,} bytes of motion that is not mapped as float32")
+                raise ValueError(
+                    f"it has more than {LARGEST:,} bytes of motion that cannot be memory-mapped; save it as "
+                    "an npz of uncompressed float32 arrays"
+                )
             labelled = labels_of.get((split, name), labels_of.get((None, name), {}))
             yield Clip(split, name, positions, labelled, rotations=rotations if skeleton.rest else None)
             del positions, rotations
@@ -107,7 +110,7 @@ def save(path: str | Path, motion: MotionSet) -> None:
     Raises:
         OSError: a file cannot be written; the message names it.
         ValueError: the name of a clip contains a slash, which would be read as part of the split, or `read_motion`
-            would refuse it.
+            would refuse the file.
     """
     save_clips(path, iter(motion), lambda: motion.skeleton)
 
@@ -129,7 +132,7 @@ def save_clips(path: str | Path, clips: Iterator[Clip], skeleton: Callable[[], S
             if "/" in clip.name or clip.name.endswith(ROTATIONS):
                 raise ValueError(
                     f"clip name {clip.name!r} has a slash, which separates split and clip in the file, or ends in "
-                    f"{ROTATIONS}"
+                    f"{ROTATIONS}, the ending of rotations; rename the clip"
                 )
             labelled.append(replace(clip, positions=np.empty((0, 0, 3)), rotations=None, truth={}))
             yield f"{clip.split}/{clip.name}", clip.positions
@@ -151,7 +154,7 @@ def own_companion(path: Path, name: str) -> Path:
 
 
 def companion(path: Path, name: str) -> Path:
-    """Return the path of the skeleton or labels of a motion file: its own if there is one, or else the folder's."""
+    """Return the path of the skeleton or labels of a motion file: its own file if it exists, else the folder's."""
     path_of_own = own_companion(path, name)
     return path_of_own if path_of_own.is_file() else path.with_name(name)
 
@@ -175,7 +178,7 @@ def write_labels(path: Path, clips: Iterable[Clip], older: Path | None = None, a
         new = {key for row in rows for key in ((row["split"], row["clip"]), (None, row["clip"]))}
         kept_rows = {key: row for key, row in read_labels(older, None).items() if key not in new}
         if any(split is None for split, _ in kept_rows):
-            raise ValueError(f"{older}: other clips have labels in it, by name alone; add a column named split")
+            raise ValueError(f"{older}: it labels other clips by name alone; add a column named split")
         rows = [*kept_rows.values(), *rows]
     columns = list(dict.fromkeys(name for row in rows for name in row))
     table = io.StringIO(newline="")
@@ -191,15 +194,17 @@ def check_key(key: tuple[str, str], path: Path | None = None) -> None:
     """Raise an error if a split or a clip name is not printable."""
     if not all(map(is_name, key)):
         raise ValueError(
-            f"{brief(str(path or '/'.join(key)))} is not a name of a split and a clip: expected text that can be "
-            "printed"
+            f"{brief(str(path or '/'.join(key)))} is not a valid name of a split and a clip: expected at "
+            "most 1000 printable characters"
         )
 
 
 def _skeleton_of(
     path: Path, clips: Sequence[_ClipArrays], selected: Sequence[int] | None
 ) -> tuple[Skeleton, tuple[int, ...] | None]:
-    """Return the skeleton of a file, read or known by its subjects, and the indices of its joints in the file.
+    """Return the skeleton of a file, and the indices of its joints in the file.
+
+    The skeleton is read from a file next to it, or known from the names of the subjects.
 
     Raises:
         ValueError: the numbers of joints in skeleton and file differ, or no skeleton is known.
@@ -222,7 +227,10 @@ def _skeleton_of(
 
 
 def read_labels(default: Path, labels: str | Path | None) -> dict[tuple[str | None, str], dict[str, str]]:
-    """Return rows by (split, clip), or by (None, clip) without a split column; `default` replaces absent `labels`."""
+    """Return the rows of a file of labels by (split, clip), or by (None, clip) if it has no column split.
+
+    The file is `labels`, or `default` if `labels` is None; without a default file there are no rows.
+    """
     file = Path(labels) if labels else default
     if not file.is_file():
         if labels:
@@ -252,7 +260,7 @@ def _table(path: Path, *most: int) -> Iterator[tuple[list[str], Iterator[tuple[i
     def numbered() -> Iterator[tuple[int, list[str]]]:
         for number, row in enumerate(reader, 2):
             if row and len(row) != len(header):
-                raise ValueError(f"{path}: row {number} has {len(row)} cells, the header {len(header)}")
+                raise ValueError(f"{path}: row {number} has {len(row)} cells, expected {len(header)} as in the header")
             yield number, row
 
     with text_of(path, *most) as text:
@@ -297,7 +305,8 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
     for joint, values in paths.items():
         if values.ndim != 2 or values.shape[1] != 3 or values.dtype.kind not in "fiu":
             raise ValueError(
-                f"{path}: the path of {joint} is {values.dtype} {values.shape}, expected numbers (frames, 3)"
+                f"{path}: the path of {joint} has dtype {values.dtype} and shape {values.shape}, expected numbers "
+                "(frames, 3)"
             )
         far = np.abs(values) > np.finfo(np.float32).max  # the limit of float32, which models use; NaN passes
         if far.any():
@@ -322,7 +331,7 @@ def _read_columns(path: Path, numbers: int = MOST_NUMBERS, *most: int) -> dict[s
                 )
             axes["xyz".index(axis)] = column
         if short := [joint for joint, axes in columns.items() if min(axes) < 0]:
-            raise ValueError(f"{path}: a column of {short[0]} is missing")
+            raise ValueError(f"{path}: {short[0]} needs three columns, {short[0]}_x, {short[0]}_y and {short[0]}_z")
         values: list[np.ndarray] = []
         blank = 0
         for number, cells in rows:
@@ -362,7 +371,7 @@ def read_table(path: Path) -> Recording:
     skeleton = Skeleton.from_json(file)
     if set(columns) != set(skeleton.names):
         differing = ", ".join(sorted(set(columns) ^ set(skeleton.names)))
-        raise ValueError(f"{path}: {file} and the columns do not have the same joints: {differing[:600]}")
+        raise ValueError(f"{path}: the joints in its columns differ from those in {file}: {differing[:600]}")
     positions = np.stack([columns[name] for name in skeleton.names], 1)
     return Recording(
         skeleton.names, skeleton.parents, positions, fps=skeleton.fps, metres=1.0, up=skeleton.up, skeleton=skeleton

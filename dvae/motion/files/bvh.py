@@ -50,7 +50,7 @@ def read_bvh(path: str | Path) -> Recording:
     rows, remainder = divmod(len(values), channels) if channels else (0, 0)
     if remainder or abs(rows - frames) > 1 or not rows:
         raise ValueError(
-            f"{path}: {len(values):,} numbers follow, expected {frames:,} frames of {channels} channels each"
+            f"{path}: its motion has {len(values):,} numbers, expected {frames:,} frames of {channels} channels each"
         )
     check_size(path, rows, len(joints))
     values = values.reshape(rows, channels)
@@ -106,7 +106,9 @@ def write_bvh(
     """
     for name in names:
         if not name or any(letter.isspace() or letter in "{}" for letter in name):
-            raise ValueError(f"{path}: {name!r} is not a joint name for a BVH file: no white space, no braces")
+            raise ValueError(
+                f"{path}: a joint name in a BVH file has no white space or braces, got {name!r}; rename it"
+            )
         if names.count(name) > 1:
             raise ValueError(f"{path}: {names.count(name)} joints are named {name!r}, expected different names")
     children: list[list[int]] = [[] for _ in names]
@@ -139,7 +141,7 @@ def write_bvh(
 
 
 def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
-    """Return the joints, parents first, and the line of MOTION, where this word is removed.
+    """Return the joints, parents first, and the index of the line with MOTION; remove this word from `lines`.
 
     Words may be split over lines arbitrarily, except that the name of a joint, which may have several words, is on one
     line.
@@ -169,7 +171,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             continue
         if kind == "MOTION":
             if open_ or awaits_brace or not joints:
-                raise error(number, "MOTION after a complete hierarchy")
+                raise error(number, "MOTION only after a complete hierarchy")
             lines[number - 1] = lines[number - 1][lines[number - 1].upper().rindex(kind) + len(kind) :]
             return joints, number - 1
         if kind in ("ROOT", "JOINT", "END"):
@@ -194,7 +196,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             awaits_brace = False
         elif kind == "}":
             if not open_ or awaits_brace:
-                raise error(number, "a brace that was opened")
+                raise error(number, "a closing brace only after its opening brace")
             closed = joints[open_.pop()]
             if closed.ends and closed is joints[-1] and not (closed.offset.any() or closed.channels):
                 joints.pop()  # the end coincides with its parent
@@ -207,7 +209,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
             count, *channels = [word.lower() for word in following(_is_value)] or [""]
             unknown = [channel for channel in channels if channel not in _AXES]
             if unknown or not count.isdecimal() or len(channels) != len(set(channels)) or str(len(channels)) != count:
-                raise error(number, "the number of channels, then Xposition ... Zrotation, each once")
+                raise error(number, "the number of channels, then as many names from Xposition to Zrotation, each once")
             joints[open_[-1]].channels = [_AXES.index(channel) for channel in channels]
         else:
             raise error(number, "ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION or a brace")
@@ -233,5 +235,7 @@ def _header(path: Path, lines: list[str], line: int) -> tuple[int, float, int]:
         values.append(numbers_read[0])
     frames, seconds = values
     if frames != int(frames) or frames < 1 or not 1e-6 < seconds < 1e3:
-        raise ValueError(f"{path}: {frames:g} frames of {seconds:g} s each are not a recording")
+        raise ValueError(
+            f"{path}: it declares {frames:g} frames of {seconds:g} s; expected a whole number and a frame time above 0"
+        )
     return int(frames), seconds, line

@@ -33,7 +33,7 @@ def get(name: str, out: str | Path, url: str | None = None) -> list[Path]:
         url: URL of a mirror.
 
     Returns:
-        The files.
+        Paths of all files of the collection.
 
     Raises:
         ValueError: the name is unknown, or the checksum of a file is wrong.
@@ -52,7 +52,7 @@ def get(name: str, out: str | Path, url: str | None = None) -> list[Path]:
         try:
             paths.append(Path(fetcher.fetch(file)))
         except ValueError as error:
-            raise ValueError(f"{address}{file}: the file differs from the known one ({error})") from None
+            raise ValueError(f"{address}{file}: the downloaded file differs from the expected one ({error})") from None
         except OSError as error:
             raise OSError(f"{address}{file} cannot be downloaded: {error}") from None
     return paths

@@ -30,10 +30,10 @@ def read_c3d(path: str | Path) -> Recording:
     """Read the labelled markers of a C3D file, and connect them by a tree.
 
     Markers have no skeleton. The tree is the minimum spanning tree over the variation of all pairwise distances, rooted
-    at the central marker, so that neighbours are at nearly constant distance. A marker that was not observed is NaN:
-    its residual is negative, or its position and residual are exactly zero. Points without a name are left out. So are
-    points that the file lists as angles, forces, moments, powers, reactions or scalars. The notes of the recording name
-    all of these points.
+    at the central marker, so that neighbours are at nearly constant distance. A marker was not observed, and is NaN, if
+    its residual is negative, or if its position and residual are exactly zero. Points without a name are left out. So
+    are points that the file lists as angles, forces, moments, powers, reactions or scalars. The notes of the recording
+    name all of these points.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -44,7 +44,7 @@ def read_c3d(path: str | Path) -> Recording:
         raise FileNotFoundError(f"{path}: no such file")
     content = files.read(path, MOST_TEXT, links=True)
     if len(content) < _BLOCK or not content[0] or content[1] != 0x50:
-        raise ValueError(f"{path}: not a C3D file: it must begin with the block of its parameters and with 80")
+        raise ValueError(f"{path}: not a C3D file: its first byte must be a block number above 0, its second byte 80")
     try:
         parameters, order = _parameters(content)
         markers, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
@@ -58,11 +58,16 @@ def read_c3d(path: str | Path) -> Recording:
     room = max(len(content) - _BLOCK * (start - 1), 0) // (kind.itemsize * row) if row and start else 0
     frames = room if last == 0xFFFF else last - first + 1  # the number of frames exceeds two bytes
     if not 0 < frames <= room or not markers:
-        raise ValueError(f"{path}: it announces {markers} markers in {frames} frames, but has room for {room}")
+        raise ValueError(
+            f"{path}: its header has {markers} markers in {frames} frames, but its data have {room} frames"
+        )
     check_size(path, frames, markers)
     unit = "".join(parameters.get("UNITS", [])[:1]).lower()
     if unit not in METRES or not 0 < fps < 1e6 or not np.isfinite(scale):
-        raise ValueError(f"{path}: markers in {unit[:40]!r} at {fps:g} Hz, expected one of {', '.join(METRES)}")
+        raise ValueError(
+            f"{path}: unit {unit[:40]!r}, rate {fps:g} Hz, scale {scale:g}; expected a unit of {', '.join(METRES)}, "
+            "a positive rate and a finite scale"
+        )
     numbers = np.frombuffer(content, kind, frames * row, _BLOCK * (start - 1)).reshape(frames, row)
     values = numbers[:, : 4 * markers].reshape(frames, markers, 4).astype(np.float64)
     places: np.ndarray = values[..., :3] * (1 if scale < 0 else scale)
@@ -100,7 +105,7 @@ def read_c3d(path: str | Path) -> Recording:
 
 
 def _numbered(parameters: dict[str, list[str]], name: str) -> list[str]:
-    """Return the texts of a parameter and its continuations: one holds 255 entries, LABELS2 and LABELS3 the rest."""
+    """Return the texts of a parameter and of its continuations, such as LABELS2; each has at most 255 entries."""
     parts = itertools.takewhile(parameters.__contains__, (f"{name}{n if n > 1 else ''}" for n in itertools.count(1)))
     return [text for part in parts for text in parameters[part]]
 

@@ -44,7 +44,7 @@ SAME = 1e-3
 BENDS = "rotations are left out, because a joint moves relative to its parent"
 
 LIKE = 1.6
-"""Maximum ratio of body sizes in one folder; smaller than 2.54, so that it detects inches among centimetres."""
+"""Maximum ratio of body sizes in one folder; below 2.54, to detect inches among centimetres."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,10 @@ def read_motion(
     | `.amc` | with its `.asf` in the same folder |
     | `.txt` | exponential maps as in the CMU benchmark |
     | `.c3d` | markers |
-    | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; with a skeleton |
+    | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; needs a skeleton |
     | `.npz` | AMASS: one clip, members `poses`, `trans`, `mocap_framerate` |
     | `.npz` | VideoPose3D's archive: the member `positions_3d` |
-    | `.npz` | any other: an array (F, J, 3) in metres for each clip under "split/clip"; with a skeleton |
+    | `.npz` | any other: an array (F, J, 3) in metres for each clip under "split/clip"; needs a skeleton |
 
     Folders are read recursively, without following links. The name of a clip is the name of its file; its split is the
     subfolder, or "all". A key of an npz without a slash also belongs to the split "all".
@@ -94,8 +94,8 @@ def read_motion(
     split, clip and any labels. VideoPose3D's archives of Human3.6M and HumanEva-I need no skeleton file; they are
     recognised by their subjects and joints.
 
-    Units and axes are read from the file, or else inferred: a person has a plausible size, and the head is above the
-    feet. `MotionSet.interpretation` describes the result.
+    Units and axes are read from the file. If the file does not state them, they are chosen so that a person has a
+    plausible size and the head is above the feet. `MotionSet.interpretation` describes the result.
 
     Args:
         path: file or folder.
@@ -108,7 +108,7 @@ def read_motion(
             {"name in the file": "name in the skeleton"}.
         metres: length of the file's unit in metres, instead of the inferred one.
         up: up axis of the file, "y" or "z", instead of the inferred one.
-        fps: true frames per second, if the file is wrong; `MotionSet.resampled` changes the frame rate.
+        fps: true frames per second, if the file states a wrong rate; `MotionSet.resampled` changes the frame rate.
         missing: keep clips in which joints are missing (NaN) in some frames.
 
     Returns:
@@ -143,8 +143,8 @@ def read_motion(
         size += clip.positions.nbytes + (0 if clip.rotations is None else clip.rotations.nbytes)
         if size > LARGEST:
             raise ValueError(
-                f"{path}: it has more than {LARGEST:,} bytes of motion, up to {file.path}; `dvae data convert --fps` "
-                "makes it smaller, or give its folders one by one"
+                f"{path}: it has more than {LARGEST:,} bytes of motion, reached at {file.path}; lower the frame rate "
+                "with `dvae data convert --fps`, or read its folders one by one"
             )
         clips.append(clip)
     if not clips:
@@ -187,12 +187,12 @@ def find_files(path: Path, labels: str | Path | None = None) -> list[File]:
                 kinds[suffix].append(File("all" if split == "." else split, file.stem, file))
                 count += 1
                 if count > MOST_FILES:
-                    raise ValueError(f"{path}: it has more than {MOST_FILES:,} files; give its folders one by one")
+                    raise ValueError(f"{path}: it has more than {MOST_FILES:,} files; read its folders one by one")
     present = {suffix: files for suffix, files in kinds.items() if files}
     certain = [suffix for suffix in present if suffix not in (".csv", ".txt")]  # many csv and txt files are not motion
     if len(certain) > 1:
         counts = " and ".join(f"{len(present[suffix])} {suffix[1:]}" for suffix in certain)
-        raise ValueError(f"{path}: it has {counts} files; put each kind into a folder of its own")
+        raise ValueError(f"{path}: it has {counts} files; put each format into a folder of its own")
     if not present:
         raise FileNotFoundError(f"{path}: no file in it is one of {', '.join(READERS)}")
     return _with_labels(present[next(iter(present))], path / LABELS, labels)
@@ -226,11 +226,12 @@ def sampled(files: Sequence[File], skip_bad: bool = False) -> dict[str, Recordin
 
 @dataclass(frozen=True)
 class FileReader:
-    """Convert files with one recording to clips with their skeletons, in the same way for all files of a folder.
+    """Converter of files with one recording to clips with their skeletons, the same for all files of a folder.
 
     Args:
         world: units and axes of the files.
-        given, up: whether the unit, and the up axis, of `world` override those in a file.
+        given: whether the unit of `world` overrides the unit in a file.
+        up: whether the up axis of `world` overrides the up axis in a file.
         fps, skeleton, joints, onto: same as in `read_motion`.
         resampled: frames per second of the result; default: the rate of the file.
         missing: whether joints may be missing.
@@ -273,10 +274,12 @@ class FileReader:
             normalised = rotate_up(normalised, self.world.up)
         fps = self.fps or normalised.fps
         if fps is None:
-            raise ValueError("it does not state its frames per second; give fps=")
+            raise ValueError("it does not state its frames per second; pass fps=")
         skeleton = self.skeleton or normalised.skeleton
         if skeleton and skeleton.joints != len(normalised.names):
-            raise ValueError(f"it has {len(normalised.names)} joints, skeleton {skeleton.name!r} has {skeleton.joints}")
+            raise ValueError(
+                f"it has {len(normalised.names)} joints, but its skeleton {skeleton.name!r} has {skeleton.joints}"
+            )
         if skeleton:
             same_tree = list(skeleton.parents) == list(normalised.parents)
             normalised = replace(normalised, names=skeleton.names, parents=skeleton.parents)
@@ -306,7 +309,7 @@ def clip_of(
 
     Args:
         recording: recording in metres.
-        clip: name, split and labels of the clip.
+        clip: clip that gives the name, split and labels.
         fps: frames per second.
         known: skeleton of the recording, if known.
         joints, onto: same as in `read_motion`.
@@ -343,13 +346,13 @@ def select_recording_joints(
 
 
 def rotate_up(recording: Recording, up: str) -> Recording:
-    """Return a recording rotated about x so that the other axis is up."""
+    """Return a recording rotated by 90 degrees about x, so that `up` (y or z) becomes the up axis."""
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
     return replace(rotate_recording(recording, turn if up == "z" else turn.T), up=up)
 
 
 class Collected:
-    """Check that the clips of a folder belong together, one clip at a time: same joints and frames per second.
+    """Record of the clips of a folder, added one at a time, which must have the same joints and frames per second.
 
     Args:
         name: name of the folder.
@@ -440,7 +443,7 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
     first, up = sets[0][0], sets[0][1].skeleton.up
     for path, motion in sets:
         if motion.skeleton.up != up:
-            raise ValueError(f"{path}: {motion.skeleton.up} is up, and {up} in {first}; give onto=")
+            raise ValueError(f"{path}: its up axis is {motion.skeleton.up}, but {up} in {first}; pass onto=")
         skipped += motion.skipped
         for clip in motion:
             if reason := collected.add(path, clip, motion.skeleton):

@@ -20,11 +20,11 @@ MOST_TEXT = 2**28
 """Maximum size of a motion text file in bytes: an hour of sixty joints at 60 Hz."""
 
 MOST_PLACES = 2**24
-"""Maximum number of frames times joints in a recording: the same duration."""
+"""Maximum number of frames times joints in a recording: an hour of sixty joints, as for `MOST_TEXT`."""
 
 
 END = "End"
-"""Suffix of the name of a joint at the end of a last bone."""
+"""Suffix of the name of a joint at the end of a bone without children."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,8 @@ class Recording:
         positions: (F, J, 3) in the unit and axes of the file.
         rotations: (F, J, 4), local quaternions w x y z without sign changes; None if the file has none.
         offsets: (J, 3), rest pose in the unit of the file; only with rotations.
-        loose: largest distance of a joint from its offset, in the unit of the file.
+        loose: largest distance between a joint's position relative to its parent and its offset, in the unit of the
+            file.
         fps: frames per second, if the file contains it.
         metres: length of the unit in metres, if the file contains it.
         up: up axis, if the file contains it.
@@ -125,5 +126,5 @@ def check_size(path: Path, frames: int, joints: int) -> None:
     """Raise an error if a recording would be too large for memory, even if its file is small."""
     if frames * joints > MOST_PLACES:
         raise ValueError(
-            f"{path}: {frames * joints:,} positions of joints are more than {MOST_PLACES:,}; cut the recording"
+            f"{path}: it has {frames * joints:,} joint positions, at most {MOST_PLACES:,} are read; cut the recording"
         )

@@ -1,10 +1,10 @@
-"""AMASS's layout (Mahmood et al. 2019, arXiv 1904.03278): rotations of SMPL's joints, without its body.
+"""AMASS's layout (Mahmood et al. 2019, arXiv 1904.03278): rotations of SMPL's joints, without the SMPL body.
 
 The files contain no bone lengths. These depend on the SMPL body, which has its own licence, and on the shape parameters
-`betas`, which clips have as a label (`bodies.betas`). Without the SMPL body, all people have one average body with a
-height of 1.7 m. Its segments are those of Drillis and Contini (1966) in figure 4.1 of Winter, Biomechanics and Motor
-Control of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the position of its
-template to `trans`. Files written here also contain `offsets`, which are used when they are read.
+`betas`, which each clip stores as a label (`bodies.betas` reads it). Without the SMPL body, all people have one average
+body with a height of 1.7 m. Its segments are those of Drillis and Contini (1966) in figure 4.1 of Winter, Biomechanics
+and Motor Control of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the position of
+its template to `trans`. Files written here also contain `offsets`, which are used when they are read.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ def read_amass(path: str | Path) -> Recording:
     with archive(path) as members:
         if not {"poses", "trans"} <= members.keys():
             raise NpyError(
-                f"it holds {', '.join(sorted(members)[:6]) or 'nothing'}, expected AMASS's poses and trans; "
-                "other npz files of clips are read one by one, not as a folder; "
-                f"`dvae data convert {path.parent}/*.npz --out ALL.npz` joins those that it wrote"
+                f"it contains {', '.join(sorted(members)[:6]) or 'nothing'}, expected AMASS's poses and trans; "
+                "npz files of another layout are read one by one, not as a folder; "
+                f"`dvae data convert {path.parent}/*.npz --out ALL.npz` joins npz files that dvae wrote"
             )
         names = ("poses", "trans", "offsets", "betas", *_FPS)
         arrays = {name: members[name].array() for name in names if name in members}
@@ -84,20 +84,25 @@ def read_amass(path: str | Path) -> Recording:
     frames, numbers = len(places) if places.ndim else 0, 3 * len(JOINTS)
     if not (poses.ndim == 2 and len(poses) == frames > 0 and poses.shape[1] >= numbers and places.shape == (frames, 3)):
         raise ValueError(
-            f"{path}: poses {poses.shape}, trans {places.shape}, expected (frames, {numbers} or more) and (frames, 3)"
+            f"{path}: poses have shape {poses.shape} and trans {places.shape}, expected "
+            f"(frames, {numbers} or more) and (frames, 3)"
         )
     check_size(path, frames, len(JOINTS))
     if "offsets" in arrays and arrays["offsets"].shape != (len(JOINTS), 3):
-        raise ValueError(f"{path}: offsets {arrays['offsets'].shape}, expected {(len(JOINTS), 3)}")
+        raise ValueError(f"{path}: offsets have shape {arrays['offsets'].shape}, expected {(len(JOINTS), 3)}")
     for name, values in arrays.items():
         if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
-            raise ValueError(f"{path}: {name} holds {values.dtype}, expected numbers, none NaN or infinite")
+            raise ValueError(
+                f"{path}: {name} has dtype {values.dtype}, or NaN or infinite values; expected finite numbers"
+            )
         if (np.abs(values.astype(np.float64)) > 1e6).any():
-            raise ValueError(f"{path}: {name} holds {np.abs(values).max():g}, which is not a metre, radian or rate")
+            raise ValueError(
+                f"{path}: {name} has the value {np.abs(values).max():g}; expected metres, radians or a rate up to 1e6"
+            )
     rate = next((arrays[name] for name in _FPS if name in arrays), np.zeros(0))
     fps = float(rate.reshape(-1)[0]) if rate.size == 1 else 0.0
     if not fps > 0:
-        raise ValueError(f"{path}: it needs mocap_framerate, frames per second")
+        raise ValueError(f"{path}: mocap_framerate must be a positive number of frames per second")
     offsets = arrays.get("offsets", OFFSETS).astype(np.float64)
     vectors = torch.from_numpy(poses[:, :numbers].astype(np.float64)).unflatten(-1, (-1, 3))
     rest = torch.from_numpy(offsets).repeat(frames, 1, 1)
@@ -125,7 +130,9 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     joint_of_part = parts(skeleton.names)
     joint_of_name = {name: joint_of_part[part] for part, name in _part_names().items() if part in joint_of_part}
     if "Pelvis" not in joint_of_name:
-        raise ValueError(f"{path}: no joint is the pelvis; there are {', '.join(skeleton.names)[:600]}")
+        raise ValueError(
+            f"{path}: no joint is the pelvis, which AMASS requires; the joints are {', '.join(skeleton.names)[:600]}"
+        )
     names = [name for name in JOINTS if name in joint_of_name]
     parents_of_names = [_above(name, names) for name in names]
     parents = [names.index(parent) if parent else -1 for parent in parents_of_names]

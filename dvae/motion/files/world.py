@@ -32,7 +32,7 @@ _BOTTOM = re.compile(r"foot|toe|ankle|heel", re.IGNORECASE)
 def upright(recording: Recording) -> tuple[str, bool]:
     """Return the axis along which the person stands, and whether it points up.
 
-    It is found from heads and feet, or else from the longest extent.
+    The axis is the one from feet to head. If no joint names match these, it is the axis of the longest extent.
 
     Axes of files are right-handed; in most files y or z is up.
     """
@@ -77,8 +77,8 @@ def _from_feet_to_head(names: Sequence[str], positions: np.ndarray) -> np.ndarra
 def height_of(recording: Recording) -> float:
     """Estimate the body's height in the recording's unit, whatever the pose: the length of the bones from head to foot.
 
-    It is the median over all joints whose names identify heads and feet, and over frames; without such names, the
-    body's largest extent.
+    The estimate is the median over frames and over all joints whose names identify heads and feet. Without such names,
+    it is the body's largest extent.
     """
     parents, places = recording.parents, fullest(recording.positions)
     chains: list[set[int]] = []  # for each joint, the joints up to the root
@@ -107,7 +107,7 @@ def unit(recording: Recording) -> tuple[str, float]:
     if not fitting[name] <= log(WITHIN):
         raise ValueError(
             f"the body is about {height:.4g} tall (median over frames), which is not a person's height in any of "
-            f"{', '.join(UNITS)}; give the metres of the file's unit"
+            f"{', '.join(UNITS)}; pass the length of the file's unit in metres (`metres`)"
         )
     return name, UNITS[name]
 
@@ -120,7 +120,7 @@ class World:
         unit: name of the files' unit.
         metres: length of the unit in metres.
         axis: axis along which people stand.
-        upwards: whether it points up.
+        upwards: whether this axis points up.
     """
 
     unit: str
@@ -150,9 +150,9 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
         ValueError: no unit fits, the recordings have different units, or an argument is not a valid unit or axis.
     """
     if up not in (None, "y", "z"):
-        raise ValueError(f"the up axis is {up!r}, expected 'y' or 'z'")
+        raise ValueError(f"`up` must be 'y' or 'z', got {up!r}")
     if metres is not None and not 1e-6 < metres < 1e6:
-        raise ValueError(f"the unit is {metres} m, expected a length such as 0.01 for centimetres")
+        raise ValueError(f"`metres` must be the length of a unit in metres, such as 0.01 for centimetres, got {metres}")
     units: dict[tuple[str, float], str] = {} if metres is None else {("as given", metres): ""}
     unknown = []
     for name, recording in recordings.items() if metres is None else ():
@@ -165,7 +165,8 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
     if len({length for _, length in units}) > 1:
         ((first, _), first_name), ((other, _), other_name), *_ = units.items()
         raise ValueError(
-            f"{first_name} seems to be in {first}, {other_name} in {other}; give the metres of the unit of all"
+            f"{first_name} seems to be in {first}, {other_name} in {other}; if all have the same unit, pass its length "
+            "in metres (`metres`)"
         )
     axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
     return World(*next(iter(units)), axis, upwards)

@@ -39,8 +39,8 @@ def format_of(path: str | Path, format: str | None = None) -> str:
         format = suffix.removeprefix(".")
     if format not in FORMATS or suffix not in ("", FORMATS[format]):
         raise ValueError(
-            f"{path}: which format? Motion is written as {', '.join(FORMATS)}: end the name in one of "
-            f"{', '.join(dict.fromkeys(FORMATS.values()))}, or give the format of the files in a folder "
+            f"{path}: the format is unknown or contradicts the ending. The formats are {', '.join(FORMATS)}: end the "
+            f"name in one of {', '.join(dict.fromkeys(FORMATS.values()))}, or give the format of the files in a folder "
             "(`--format` of `dvae data convert`, `format=` in Python)"
         )
     if format == "npz" and not suffix:
@@ -110,7 +110,7 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
         return
     if np.isnan(clip.positions).any():
         raise ValueError(
-            f"clip {brief('/'.join(clip.key))} has missing joints, but {format} has no gaps; fill them first "
+            f"clip {brief('/'.join(clip.key))} has missing joints, which {format} cannot represent; fill them in first "
             "(`dvae impute RUN --filled FILE`), or write npz or csv, where they are NaN"
         )
     rotated = motion.with_rotations()
@@ -137,7 +137,7 @@ def _path_of(path: Path, clip: Clip, format: str) -> Path:
         return path
     inner = Path("" if clip.split == "all" else clip.split, clip.name + FORMATS[format])
     if inner.is_absolute() or ".." in inner.parts or Path(clip.name).name != clip.name:
-        raise ValueError(f"clip {brief('/'.join(clip.key))}: its name leads out of the folder {path}")
+        raise ValueError(f"clip {brief('/'.join(clip.key))}: its name leads out of the folder {path}; rename the clip")
     return path / inner
 
 
@@ -164,7 +164,7 @@ def convert(
         onto: known skeleton to convert to.
         jobs: number of processes; -1 for one per core.
         metres, up: same as in `read_motion`.
-        recorded: true frames per second of the files, if the files are wrong about it.
+        recorded: true frames per second of the files, if the files state a wrong rate.
         skip_bad: leave out unusable clips.
         missing: keep clips in which joints are missing (NaN) in some frames.
 
@@ -182,8 +182,8 @@ def convert(
     if archives := [source for source, inner in zip(sources, files_of_sources, strict=True) if not inner]:
         if files:
             raise ValueError(
-                f"{archives[0]} is an archive of clips and {files[0].path} is a recording; give one kind at a time, "
-                "then join the archives"
+                f"{archives[0]} is an archive of clips and {files[0].path} is a recording; convert each kind alone, "
+                "then join the resulting archives"
             )
         options: Any = {"metres": metres, "up": up, "fps": recorded, "missing": missing}
         motions = [read_motion(source, skip_bad=skip_bad, onto=onto, **options) for source in sources]
@@ -242,7 +242,11 @@ def _files_of(source: Path, several: bool) -> list[File]:
 def _convert_file(
     reader: FileReader, file: File, out: Path, format: str, skip_bad: bool
 ) -> tuple[Clip, Skeleton, list[str]] | str:
-    """Read one file, and write it if each clip has a file; return its content, or the reason why it is unusable."""
+    """Read one file, and write its clip unless all clips go into one npz.
+
+    Returns:
+        Clip (its fullest frame if it was written), skeleton and notes; or the reason why the file cannot be used.
+    """
     try:
         clip, skeleton, notes = reader(file)
         if format == "npz":

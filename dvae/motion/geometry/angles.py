@@ -23,7 +23,7 @@ from .skeleton import Skeleton, differences, inverse_lengths
 Vector: TypeAlias = "str | tuple[Vector, str, Vector]"
 
 BLOCK = 4096
-"""Number of poses whose limits are estimated at once, so that their vectors stay in cache."""
+"""Number of poses whose cosines are computed at once, so that their vectors stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Angle:
     """The cosine of the angle between two vectors.
 
     Args:
-        name: name; angles of the same name (left and right) share their limits.
-        first, second: vectors.
-        when: (u, v, sign): only poses with a negative inner product of u and v (sign -1), or with a nonnegative one
-            (sign 1), have this angle.
+        name: name of the angle; angles of the same name (left and right) share their limits.
+        first, second: the two vectors.
+        when: condition (u, v, sign) on a pose to have this angle: the inner product of the vectors u and v is negative
+            (sign -1), or not negative (sign 1). None if every pose has the angle.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Angle:
 
 
 def _mirrored(vector: Vector) -> Vector:
-    """Exchange left and right; a reflection reverses cross products."""
+    """Return the vector with left and right exchanged; a reflection reverses cross products."""
     if isinstance(vector, str):
         return {"L": "R", "R": "L"}.get(vector[0], vector[0]) + vector[1:]
     a, operation, b = vector
@@ -109,7 +109,11 @@ def _humaneva() -> Iterator[Angle]:
 
 
 def _trunk_and_limbs(head: Vector) -> Iterator[Angle]:
-    """Yield the angles for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head."""
+    """Yield the angles for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head.
+
+    Args:
+        head: vector along the head.
+    """
     trunk, across_hips = ("Neck", "-", "Spine"), ("LHip", "-", "RHip")
     hips, shoulders = (across_hips, "x", "Spine"), ("LShoulder", "-", "RShoulder")
     chest = (shoulders, "x", ("Neck", "-", "Chest"))  # normals point to the front
@@ -155,8 +159,8 @@ class AngleLimits:
     """Limits of the cosines of joint angles in real poses.
 
     Args:
-        names: the names of the A angles, as in `ANGLES`.
-        low, high: (A,) smallest and largest cosine.
+        names: names of the A angles, in the order of `ANGLES`.
+        low, high: (A,) smallest and largest cosine of each angle.
 
     Raises:
         ValueError: the sizes differ, or a lower limit is above the upper one.
@@ -170,27 +174,31 @@ class AngleLimits:
         sizes = (len(self.names),)
         if self.low.shape != sizes or self.high.shape != sizes:
             raise ValueError(
-                f"{len(self.names)} angles with limits of shapes {tuple(self.low.shape)} and "
-                f"{tuple(self.high.shape)}, expected {sizes} twice"
+                f"`low` and `high` must have shape {sizes}, one limit per angle, got {tuple(self.low.shape)} and "
+                f"{tuple(self.high.shape)}"
             )
         limits = zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
         crossed = [name for name, low, high in limits if not low <= high]
         if crossed:
-            raise ValueError(f"lower limits exceed upper ones, or are not numbers: {', '.join(dict.fromkeys(crossed))}")
+            raise ValueError(
+                "each lower limit must be at most the upper limit, and neither may be NaN; wrong limits: "
+                f"{', '.join(dict.fromkeys(crossed))}"
+            )
 
 
 def cosines(poses: Tensor, skeleton: Skeleton) -> Tensor:
     """Return the cosines of all angles of `ANGLES[skeleton.name]`.
 
-    An angle that a pose does not have, because of `Angle.when`, is NaN: comparisons with limits are false, and its
-    gradient is zero. A vector shorter than 1e-6 has cosine 0 with every other vector, and no gradient.
+    If a pose does not meet the condition `Angle.when` of an angle, the cosine is NaN. Its comparisons with limits are
+    then false, and its gradient is zero. A vector shorter than 1e-6 has cosine 0 with every other vector, and gradient
+    zero.
 
     Args:
         poses: (..., D) in metres, D = 3 J, or 3 (J - 1) without the root.
         skeleton: skeleton of the poses, in `ANGLES`.
 
     Returns:
-        Cosines (..., A).
+        Cosines (..., A) of the A angles, in the order of `ANGLES[skeleton.name]`.
 
     Raises:
         ValueError: D has another value, or the skeleton has no angles.
@@ -233,12 +241,12 @@ def estimate_angle_limits(poses: Tensor, skeleton: Skeleton, quantile: float = 0
         The limits; an angle that no pose has is unrestricted, from -1 to 1.
 
     Raises:
-        ValueError: `poses` is empty, the quantile is not in [0, .5), or `cosines` raises it.
+        ValueError: `poses` is empty or has another D, the quantile is not in [0, .5), or the skeleton has no angles.
     """
     if not 0 <= quantile < 0.5:
-        raise ValueError(f"quantile is {quantile}, expected the share beyond each limit, from 0 to below .5")
+        raise ValueError(f"`quantile` (share of poses beyond a limit) must be at least 0 and below .5, got {quantile}")
     if not poses.numel():
-        raise ValueError(f"no poses in a tensor of shape {tuple(poses.shape)}: limits need at least one")
+        raise ValueError(f"limits need at least one pose, got none in a tensor of shape {tuple(poses.shape)}")
     with torch.no_grad():
         cos = torch.cat([cosines(block, skeleton) for block in poses.reshape(-1, poses.shape[-1]).split(BLOCK)])
     names = angle_names(skeleton)
@@ -263,21 +271,24 @@ def angle_names(skeleton: Skeleton) -> tuple[str, ...]:
 def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
     if skeleton.name not in ANGLES:
         names = ", ".join(ANGLES)
-        raise ValueError(f"no joint angles for skeleton {skeleton.name!r}: there are some for {names}; use angles=0")
+        raise ValueError(
+            f"joint angles are defined for the skeletons {names}, not for {skeleton.name!r}; use angles=0 to train "
+            "without angle limits"
+        )
     return ANGLES[skeleton.name]
 
 
 class _Plan(NamedTuple):
-    """Indices of the vectors to compute, and of the pairs of vectors whose cosines are the angles of a skeleton."""
+    """Computation of all angles of a skeleton: which vectors to compute, and which pairs of them have the cosines."""
 
     differences: tuple[tuple[int, int], ...]
     """The basic vectors, as (from, to) joints."""
     crosses: list[tuple[Tensor, Tensor]]
-    """Factors of each round of cross products; the results are appended to the vectors."""
+    """Indices of both factors in each round of cross products, whose results are appended to the vectors."""
     first: Tensor
     second: Tensor
     partial: Tensor
-    """The angles that only some poses have, and their condition: u v < 0, or not."""
+    """Indices of the angles that only some poses have: u v < 0 where `negative` is True, u v >= 0 elsewhere."""
     u: Tensor
     v: Tensor
     negative: Tensor
@@ -317,9 +328,9 @@ def _depth(vector: Vector, depths: dict[Vector, int]) -> int:
 
 
 def _joints(vector: Vector, skeleton: Skeleton) -> tuple[int, int]:
-    """Return (from, to) of a position or a difference."""
+    """Return the indices (from, to) of the joints at the ends of a vector that is a position or a difference."""
     start, end = (skeleton.names[skeleton.root], vector) if isinstance(vector, str) else (vector[2], vector[0])
     missing = [name for name in (start, end) if name not in skeleton.names]
     if missing:
-        raise ValueError(f"skeleton {skeleton.name!r} has no joint {missing[0]!r}, which its angles read")
+        raise ValueError(f"skeleton {skeleton.name!r} has no joint {missing[0]!r}, but the angles of this name need it")
     return skeleton.names.index(start), skeleton.names.index(end)

@@ -1,4 +1,4 @@
-"""Errors of Euler angles at a few times, for the best of K futures.
+"""Errors of forecast Euler angles at fixed times, for the best of K futures.
 
 This is the usual score of deterministic motion forecasts. Let e_t be the angles of all joints at time t, and e^k_t the
 angles of future k. The error
@@ -14,11 +14,11 @@ Martinez, Black and Romero, 2017, arXiv 1705.02445, which later work uses:
   of ours.) They are between -pi and pi. Differences are not wrapped, so a difference across pi is off by 2 pi.
 * The norm is over all angles that vary, i.e. whose standard deviation is above 1e-4. The public code computes it over
   the frames of a forecast. We compute it over all true windows, so that all methods are scored on the same angles.
-* Each time uses the nearest frame, counted from the last observed one.
+* The error at a time is the error at the frame nearest to it; time 0 is the last observed frame.
 
 Aliakbarian et al., 2020, arXiv 1908.00733, score the best of K futures (K = 50, and 1 to 500): "at least one is close
 to the ground truth". They call it the S-MSE of Yan et al., 2018, arXiv 1808.04545. They do not say whether the best
-future is the same at all times. Here it is: the best future has the smallest mean error over the times, so the same
+future is the same at all times. Here it is the same: the best future has the smallest mean error over the times, so one
 future is scored at 80 ms and at 1000 ms. For smaller K, the first K of all drawn futures are used.
 
 Rotations come from the data, and from models that output rotations. Positions do not determine how a bone is rotated
@@ -68,10 +68,10 @@ class AngleProtocol:
     Args:
         name: name of the protocol of the windows.
         fps: frames per second of the windows.
-        times: milliseconds from the last observed frame.
-        frames: nearest predicted frames, counted from 1.
+        times: times of the forecasts, in milliseconds from the last observed frame.
+        frames: the predicted frame nearest to each time; the first predicted frame is 1.
         inverse: whether rotations are estimated from positions.
-        observed: number of frames in `Angles` before the times: the last observed one.
+        observed: number of observed frames in each sequence of `Angles`: 1, the last observed frame of the window.
     """
 
     name: str
@@ -86,13 +86,13 @@ class Angles:
     """Euler angles of the joints in test windows: of the last observed frame, and at a few times after it.
 
     Args:
-        windows: windows of motion.
-        times: milliseconds from the last observed frame.
-        inverse: estimate the rotations from positions.
+        windows: test windows of motion.
+        times: times of the forecasts, in milliseconds from the last observed frame.
+        inverse: whether to estimate the rotations from positions.
 
     Raises:
-        ValueError: no predicted frame is nearest to a time, the windows have missing joints or no rotations, or the
-            skeleton has no rest pose.
+        ValueError: no time is given, no predicted frame is nearest to a time, the windows have missing joints or no
+            rotations, or the skeleton has no rest pose.
     """
 
     def __init__(self, windows: Windows, times: Sequence[float] = TIMES, inverse: bool = False) -> None:
@@ -103,10 +103,13 @@ class Angles:
         if beyond or not times:
             raise ValueError(
                 f"no predicted frame is nearest to {', '.join(beyond) or 'no time'} ms: windows of {protocol.name} "
-                f"have {last} frames at {protocol.fps:g} a second, {1000 * last / protocol.fps:g} ms; choose others"
+                f"predict {last} frames at {protocol.fps:g} frames per second, {1000 * last / protocol.fps:g} ms; "
+                "choose at least one time, and only times in this range"
             )
         if windows.missing:
-            raise ValueError("a missing joint leaves the rotations of others undetermined; fill the gaps first")
+            raise ValueError(
+                "a missing joint leaves the rotations of others undetermined; impute the missing joints first"
+            )
         if not inverse and protocol.representation == "positions":
             raise ValueError(
                 f"windows of {protocol.name} have positions, which do not determine all rotations; use a protocol "
@@ -119,7 +122,7 @@ class Angles:
 
     @property
     def keys(self) -> list[tuple[str, str, int]]:
-        """Keys of the windows."""
+        """Key (split, clip, first frame) of each window."""
         return self.windows.keys
 
     @property
@@ -131,18 +134,21 @@ class Angles:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Entries for a record: the joints, and the number of angles that are compared."""
+        """Entries for the record of an evaluation: names of the joints, and number of the angles that are compared."""
         names = [self.windows.skeleton.names[joint] for joint in self.joints]
         return {"joints": names, "angles": int(self.varying.sum()), "title": ["Euler angles"]}
 
     def all(self) -> Batch:
-        """Return the angles {"x": (N, 1 + times, A)}, and the past of each window that models receive."""
+        """Return a batch with the angles of the N windows and the observed frames from which models forecast.
+
+        The angles are "x", (N, 1 + times, A), in radians, for the A angles that vary. The observed frames are `MOTION`.
+        """
         batch, observed = self._batch, self.windows.protocol.observed
         return Batch({WHOLE: self._angles[..., self.varying], MOTION: batch.past(observed)})
 
     @cached_property
     def varying(self) -> Tensor:
-        """(3 J',) mask of the angles that vary over the true windows; J' joints have children."""
+        """Mask (3 J',) of the angles that vary over the true windows; J' is the number of scored joints."""
         return self._angles.double().flatten(0, 1).std(0) > VARIES
 
     @cached_property
@@ -151,7 +157,7 @@ class Angles:
 
     @cached_property
     def _angles(self) -> Tensor:
-        """(N, 1 + times, 3 J') all angles."""
+        """All angles, (N, 1 + times, 3 J'), in radians."""
         now = self.windows.protocol.observed - 1
         frames = [now, *(now + frame for frame in self.protocol.frames)]
         if self.protocol.inverse:
@@ -160,13 +166,13 @@ class Angles:
         return self.of(to_matrix(rotations, "quaternion"))
 
     def angles_of(self, x: Tensor) -> Tensor:
-        """Return angles (..., 3 J') of positions (..., D), by inverse kinematics."""
+        """Return angles (..., 3 J') in radians from positions (..., D) in metres, by inverse kinematics."""
         positions = self.windows.positions(x)
         rotations = kinematics.inverse(self.windows.skeleton, positions, self.offsets.to(positions))
         return self.of(rotations[..., self.joints, :, :])
 
     def of(self, rotations: Tensor) -> Tensor:
-        """Return angles (..., 3 J') of joint rotations (..., J', 3, 3)."""
+        """Return angles (..., 3 J') in radians from joint rotations (..., J', 3, 3)."""
         return from_matrix(rotations, FORM).flatten(-2)
 
 
@@ -192,16 +198,27 @@ class AngleModel(nn.Module):
         self.rotations = next((view_of_part for view_of_part in views if isinstance(view_of_part, Rotations)), None)
         if self.rotations is None and not angles.protocol.inverse:
             raise ValueError(
-                "a model of positions predicts no rotations; score it with inverse=True, which computes them from "
-                "positions, and score compared models likewise"
+                "a model of positions predicts no rotations; score it with inverse=True, which estimates them from "
+                "positions, for all models that are compared"
             )
 
     def is_drawn(self, means: bool = False) -> bool:
-        """Return whether forecasts are draws; the model decides."""
+        """Return whether forecasts are draws rather than means, as the model decides.
+
+        Args:
+            means: prefer means, as in `DynamicalVAE.is_drawn`.
+        """
         return self.model.is_drawn(means) if isinstance(self.model, Emitting) else not means
 
     def forecast(self, batch: Batch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
-        """Return {"x": (S, B, times, A)}, the angles at all times; the horizon equals their number."""
+        """Return forecasts {"x": (S, B, times, A)} of the angles at all times, in radians.
+
+        Args:
+            batch: batch of `Angles`, with the observed frames of B windows.
+            horizon: ignored; the times are those of the `Angles` that this object was built for.
+            samples: S, number of futures of each window.
+            options: further arguments of the model's `forecast`.
+        """
         frames, inverse = self.angles.protocol.frames, self.angles.protocol.inverse
         indices, last, recorder = [frame - 1 for frame in frames], max(frames), _Recorder()
         with serialized, recorder:  # in one chunk, so that `_Recorder` sees all draws
@@ -247,21 +264,25 @@ def euler_errors(
     Args:
         models: models by name.
         windows: test windows; they need rotations unless `inverse` is set.
-        times: milliseconds from the last observed frame.
-        counts: values of K; the largest number is drawn, and a smaller K uses the first of them.
-        inverse: estimate rotations from positions, for models of positions and those they are compared with.
+        times: times of the forecasts, in milliseconds from the last observed frame.
+        counts: values of K. The largest K futures are drawn; a smaller K uses the first K of them.
+        inverse: whether to estimate rotations from positions; necessary if any of the models predicts positions.
         seed: seed of the draws of every model.
-        batch_size: windows forecast at once, with all of their futures.
+        batch_size: number of windows that are forecast at once, with all of their futures.
         progress: whether to show a progress bar.
 
     Returns:
-        An evaluation with a score "400 ms, best of 50" for each time and K, clustered by clip.
+        An evaluation with one score for each time and K, such as "400 ms, best of 50", in radians. Its standard errors
+        treat windows of one clip as dependent.
 
     Raises:
-        ValueError: a time is beyond the windows, or windows or models have no rotations and `inverse` is not set.
+        ValueError: `counts` is empty or below 1, a time is beyond the windows, or windows or models have no rotations
+            and `inverse` is not set.
     """
     if not counts or min(counts) < 1:
-        raise ValueError(f"the best future is chosen among at least one, got {list(counts)}")
+        raise ValueError(
+            f"`counts` needs numbers of at least 1 (futures from which the best is chosen), got {list(counts)}"
+        )
     angles = Angles(windows, times, inverse)
     return evaluate(
         {name: AngleModel(model, angles) for name, model in models.items()},

@@ -18,7 +18,7 @@ from .rotations import perpendicular, procrustes
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 TIE = 1e-6
-"""Weight of the parent's rotation relative to unit vectors; it fixes rotations that the vectors leave open."""
+"""Weight of the parent's rotation relative to unit vectors; it decides where the vectors fit several rotations."""
 
 
 def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:
@@ -31,7 +31,7 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
         root: (..., 3) position of the root; the root's offset in the rest pose is ignored.
 
     Returns:
-        positions (..., J, 3), and rotations relative to the world (..., J, 3, 3).
+        Positions (..., J, 3) in metres, and rotations relative to the world (..., J, 3, 3).
     """
     generations = [[list(parents).index(-1)]]
     while below := [joint for joint, parent in enumerate(parents) if parent in generations[-1]]:
@@ -53,22 +53,27 @@ def forward(parents: Sequence[int], rotations: Tensor, offsets: Tensor, root: Te
 
 
 def resting(parents: Sequence[int], offsets: Tensor) -> Tensor:
-    """Return the rest pose (..., J, 3) with the root at 0, from offsets (..., J, 3) from the parents."""
+    """Return joint positions (..., J, 3) in the rest pose, with the root at 0.
+
+    Args:
+        parents: index of each joint's parent, -1 for the root.
+        offsets: (..., J, 3) offset of each joint from its parent, in the unit of the result.
+    """
     unturned = torch.eye(3).to(offsets).expand(len(parents), 3, 3)
     return forward(parents, unturned, offsets, offsets.new_zeros(*offsets.shape[:-2], 3))[0]
 
 
 def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
-    """Return local rotations for which `forward` approximates poses as closely as the bone lengths allow.
+    """Return local rotations with which `forward` approximates the directions of a pose's bones.
 
     Each joint with several children is rotated by Procrustes analysis of the unit vectors to its children. A joint with
-    one child is aligned with it exactly, by the smallest rotation relative to its parent. A joint without children
-    keeps its parent's rotation.
+    one child gets the smallest rotation relative to its parent that aligns the bone to the child exactly. A joint
+    without children is not rotated relative to its parent.
 
     Args:
         skeleton: skeleton of the poses.
-        positions: (..., J, 3).
-        offsets: (J, 3), rest pose.
+        positions: (..., J, 3), in metres.
+        offsets: (J, 3) rest pose, in metres.
 
     Returns:
         Rotations (..., J, 3, 3).
@@ -111,7 +116,7 @@ def swing(start: Tensor, end: Tensor) -> Tensor:
 def orthogonal(turn: Tensor) -> Tensor:
     """Remove rounding errors from a rotation (..., 3, 3), which would grow along a chain of products.
 
-    One step of Newton's iteration for the polar factor (Higham 1986).
+    The function makes one step of Newton's iteration for the polar factor (Higham 1986).
     """
     return turn @ (1.5 * torch.eye(3, dtype=turn.dtype, device=turn.device) - 0.5 * turn.transpose(-1, -2) @ turn)
 
@@ -133,7 +138,7 @@ def rest(skeleton: Skeleton, positions: Tensor, rounds: int = 10) -> Tensor:
         rounds: iterations of the Procrustes analysis.
 
     Returns:
-        Offsets (J, 3), zero for the root.
+        Offsets (J, 3) in metres of each joint from its parent, zero for the root.
     """
     joints = [joint for joint, parent in enumerate(skeleton.parents) if parent >= 0]
     parents = [skeleton.parents[joint] for joint in joints]

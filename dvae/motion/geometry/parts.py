@@ -53,25 +53,31 @@ def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[in
     for text in parts:
         name, _, members = text.partition("=")
         if not name.isidentifier() or name in joints_of:
-            raise ValueError(f"parts must have different names, such as lower and upper; got {', '.join(parts)}")
+            raise ValueError(
+                "parts must have different names of letters and digits, such as lower and legs=left_leg+right_leg; "
+                f"got {', '.join(parts)}"
+            )
         joints_of[name] = places_of(skeleton, (members or name).split("+"))
     joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
     everything = sorted(index for indices in joints_of.values() for index in indices)
     if everything != list(range(len(joints))):
         invalid = [name for index, name in enumerate(joints) if everything.count(index) != 1]
-        raise ValueError(f"every joint but the root must be in one part; {', '.join(invalid)} are in none or several")
+        raise ValueError(
+            "every joint except the root must be in exactly one part, but these are in none or in several: "
+            f"{', '.join(invalid)}"
+        )
     return joints_of
 
 
 def places_of(skeleton: Skeleton, members: Iterable[str]) -> tuple[int, ...]:
-    """Return the joints of parts and of single joints.
+    """Return the indices of joints that are named singly or as parts.
 
     Args:
         skeleton: skeleton.
         members: names of parts, as in `body_parts`, or of joints.
 
     Returns:
-        Ascending indices among all joints except the root; joints that are named several times are repeated.
+        Ascending indices among all joints except the root. A joint that is named several times occurs several times.
 
     Raises:
         ValueError: a name is unknown.

@@ -7,8 +7,8 @@ as the import of torch.
 Derivatives of conversions to matrices are always correct. Derivatives of conversions from matrices are correct except
 where a form is discontinuous:
 
-* A quaternion changes its sign where another of its components becomes the largest.
-* A vector changes to the opposite end of its axis at half a turn.
+* A quaternion may change its sign where another of its components becomes the largest.
+* A vector changes its sign at half a turn.
 * Euler angles jump at half a turn, and where the second angle aligns the axes of the other two.
 
 | form | numbers | |
@@ -34,13 +34,15 @@ _WHOLE = re.compile(r"euler-([xyz])(?!\1)([xyz])(?!\2)([xyz])")
 
 
 def size(form: str) -> int:
-    """Return the number of values of a rotation in a form.
+    """Return the number of values that represent one rotation in a form, such as 6 for "6d".
 
     Raises:
         ValueError: the form is unknown.
     """
     if form not in SIZES and not _EULER.fullmatch(form):
-        raise ValueError(f"rotations have no form {form!r}; expected {', '.join(SIZES)}, or euler- and axes as in zyx")
+        raise ValueError(
+            f"unknown form of rotations {form!r}; known: {', '.join(SIZES)}, or euler- with axes, such as euler-zyx"
+        )
     return SIZES.get(form, len(form) - len("euler-"))
 
 
@@ -59,7 +61,10 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         tensor([ 0., -1.,  0.])
     """
     if values.shape[-1] != size(form):
-        raise ValueError(f"a rotation as {form} has {size(form)} numbers, got {tuple(values.shape)}")
+        raise ValueError(
+            f"a rotation in the form {form} has {size(form)} numbers in the last dimension, got the shape "
+            f"{tuple(values.shape)}"
+        )
     if form == "matrix":
         return values.unflatten(-1, (3, 3))
     roma = optional("roma", "motion")
@@ -88,13 +93,14 @@ def from_matrix(rotations: Tensor, form: str) -> Tensor:
     """Convert rotation matrices (..., 3, 3) to a form, (..., `size(form)`).
 
     Raises:
-        ValueError: the form is unknown, or the shape is not (..., 3, 3).
+        ValueError: the form is unknown, has Euler axes that cannot represent every rotation, or the shape is not
+            (..., 3, 3).
     """
     if rotations.shape[-2:] != (3, 3):
         raise ValueError(f"expected matrices (..., 3, 3), got {tuple(rotations.shape)}")
     if form not in SIZES and not _WHOLE.fullmatch(form):
         size(form)
-        raise ValueError(f"{form} cannot represent every rotation; expected three axes, no two alike in a row")
+        raise ValueError(f"{form} cannot represent every rotation; use three axes, none twice in a row, as in zyx")
     if form == "matrix":
         return rotations.flatten(-2)
     if form == "6d":
@@ -116,10 +122,10 @@ def normalised(quaternions: Tensor) -> Tensor:
 
 
 def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
-    """Return the same rotations as quaternions (..., 4) whose signs avoid jumps: each is nearest to its predecessor.
+    """Return quaternions of the same rotations, with signs such that each is nearest to the quaternion before it.
 
     Args:
-        quaternions: quaternions of unit length.
+        quaternions: (..., 4), of unit length.
         dim: dimension of time; the default is the first dimension of (F, J, 4).
     """
     with torch.no_grad():
@@ -131,7 +137,7 @@ def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
 
 
 def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
-    """Convert rotations (..., T, J, 3, 3) to a form without the jumps of `from_matrix` between frames.
+    """Convert rotations of J joints over T frames to a form, without the jumps of `from_matrix` between frames.
 
     If a rotation has several quaternions or vectors, each frame uses the one nearest to the previous frame. The first
     frame uses the quaternion with w >= 0, or the vector of at most half a turn. A frame therefore never depends on
@@ -141,6 +147,12 @@ def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
         rotations: (..., T, J, 3, 3), or (..., T, J, 4) for quaternions.
         form: form of the result.
         given: form of `rotations`, "matrix" or "quaternion".
+
+    Returns:
+        (..., T, J, `size(form)`).
+
+    Raises:
+        ValueError: as in `from_matrix`.
     """
     if given == form == "quaternion":
         values = normalised(rotations)
@@ -168,7 +180,7 @@ def _unwrap(vectors: Tensor) -> Tensor:
 
 
 def perpendicular(vectors: Tensor) -> Tensor:
-    """Return unit vectors perpendicular to unit vectors (..., 3), near the axis of their smallest component."""
+    """Return unit vectors perpendicular to unit vectors (..., 3), near the axis of the vector's smallest component."""
     axis = torch.nn.functional.one_hot(vectors.abs().argmin(-1), 3).to(vectors)
     return torch.nn.functional.normalize(axis - (axis * vectors).sum(-1, keepdim=True) * vectors, dim=-1)
 
@@ -176,7 +188,9 @@ def perpendicular(vectors: Tensor) -> Tensor:
 def procrustes(products: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) nearest to matrices.
 
-    For a product of targets and transposed sources, this is the rotation that best aligns the sources with the targets.
+    Args:
+        products: (..., 3, 3). If it is B A', with source vectors A (..., 3, n) and target vectors B (..., 3, n) as
+            columns, the result R minimises |R A - B|.
     """
     roma = optional("roma", "motion")
 

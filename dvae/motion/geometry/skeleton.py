@@ -41,14 +41,18 @@ MOST_TEXT = 2**24
 def text_of(path: Path, most: int = MOST_TEXT) -> Iterator[TextIO]:
     """Open a text file, to be read within the context.
 
+    Args:
+        path: path of the file, which may be a link.
+        most: maximum size in bytes.
+
     Raises:
         OSError: the file does not exist.
-        ValueError: it has more than `most` bytes, or is not UTF-8.
+        ValueError: the file has more than `most` bytes, or is not UTF-8.
     """
     try:
         yield io.TextIOWrapper(io.BytesIO(files.read(path, most, links=True)), encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is not text ({error})") from error
+        raise ValueError(f"{path}: is not text ({error}); save it as UTF-8") from error
 
 
 def brief(value: Any) -> str:
@@ -60,7 +64,7 @@ def brief(value: Any) -> str:
 
 
 def is_name(text: str) -> bool:
-    """Return whether a text is printable as a name: not too long, no control characters, no surrogates."""
+    """Return whether a text is valid as a name: at most 1000 characters, no control characters, no surrogates."""
     return len(text) <= 1000 and not any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text)
 
 
@@ -73,7 +77,17 @@ def _is(value: Any, kind: type) -> bool:
 
 
 def _values(items: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]:
-    """Return the values of a list as a tuple, after a check of their type."""
+    """Return the values of a list as a tuple, after checking that each is of type `kind`.
+
+    Args:
+        items: values.
+        kind: type of each value.
+        what: name of the list in error messages.
+        expected: description of the type in error messages.
+
+    Raises:
+        ValueError: `items` is no list, or an entry has another type.
+    """
     if isinstance(items, str | bytes | Mapping) or not isinstance(items, Iterable):
         raise ValueError(f"{what} is {brief(items)}, expected a list of {expected}")
     values = tuple(items)
@@ -107,10 +121,10 @@ class Skeleton:
         left, right: indices of the joints on the body's left and right side.
         up: vertical axis, "y" or "z".
         fps: frames per second of the motion recorded on this skeleton.
-        name: name.
-        lengths: reference bone lengths in metres in the order of `edges`; empty if people differ.
+        name: name of the skeleton.
+        lengths: reference bone lengths in metres, in the order of `edges`; empty if they differ between people.
         rest: flattened offsets (J, 3) of each joint from its parent in the rest pose, in metres, zero for the root;
-            empty without rotations.
+            empty if the motion has no rotations.
 
     Raises:
         ValueError: the joints do not form one tree, names repeat, or a side contains an unknown joint.
@@ -143,7 +157,7 @@ class Skeleton:
         if joints > MOST_JOINTS:
             raise ValueError(f"{label}: {joints:,} joints, expected at most {MOST_JOINTS:,}")
         if len(self.parents) != joints:
-            raise ValueError(f"{label}: {joints} names but {len(self.parents)} parents")
+            raise ValueError(f"{label}: {joints} names but {len(self.parents)} parents, expected equal numbers")
         if repeated := sorted(name for name, count in Counter(self.names).items() if count > 1):
             raise ValueError(f"{label}: joint names repeat: {_join_names(repeated)}")
         roots = [self.names[j] for j, parent in enumerate(self.parents) if parent == -1]
@@ -156,27 +170,34 @@ class Skeleton:
                     f"but joints go from 0 to {joints - 1}"
                 )
         if cyclic := set(range(joints)) - set(self.order):
-            raise ValueError(f"{label}: {self.names[min(cyclic)]} is in a cycle of joints")
+            raise ValueError(f"{label}: {self.names[min(cyclic)]} is in a cycle of joints, expected a tree")
         for side in ("left", "right"):
             unknown = [j for j in getattr(self, side) if not 0 <= j < joints]
             if unknown:
-                raise ValueError(f"{label}: {side} names joints {brief(unknown)} of {joints}")
+                raise ValueError(
+                    f"{label}: {side} names joints {brief(unknown)} of {joints}, expected indices 0 to {joints - 1}"
+                )
         if repeated_joints := [j for j, count in Counter(self.left + self.right).items() if count > 1]:
-            raise ValueError(f"{label}: left and right name {self.names[repeated_joints[0]]} twice")
+            raise ValueError(
+                f"{label}: left and right name {self.names[repeated_joints[0]]} twice, expected each joint once at most"
+            )
         if not isinstance(self.up, str) or self.up not in ("y", "z"):
             raise ValueError(f"{label}: up axis is {brief(self.up)}, expected 'y' or 'z'")
         if not _is(self.fps, Real) or not 0 < self.fps < 1e6:
-            raise ValueError(f"{label}: {brief(self.fps)} frames per second, expected more than 0")
+            raise ValueError(f"{label}: {brief(self.fps)} frames per second, expected a number above 0 and below 1e6")
         if self.lengths and len(self.lengths) != joints - 1:
-            raise ValueError(f"{label}: {len(self.lengths)} bone lengths for {joints - 1} bones")
+            raise ValueError(f"{label}: {len(self.lengths)} bone lengths for {joints - 1} bones, expected one per bone")
         if invalid := [length for length in self.lengths if not 0 <= length < 1e6]:
-            raise ValueError(f"{label}: a bone is {brief(invalid[0])} m long")
+            raise ValueError(f"{label}: a bone is {brief(invalid[0])} m long, expected 0 to 1e6 m")
         if self.rest and len(self.rest) != 3 * joints:
             raise ValueError(
                 f"{label}: the rest pose has {len(self.rest)} numbers, expected 3 for each of {joints} joints"
             )
         if invalid := [offset for offset in self.rest if not abs(offset) < 1e6]:
-            raise ValueError(f"{label}: in the rest pose a joint is {brief(invalid[0])} m from its parent")
+            raise ValueError(
+                f"{label}: in the rest pose a joint is {brief(invalid[0])} m from its parent along an axis, expected "
+                "less than 1e6 m"
+            )
 
     @property
     def joints(self) -> int:
@@ -189,10 +210,10 @@ class Skeleton:
         return self.parents.index(-1)
 
     def find(self, joint: str) -> int:
-        """Return the index of a joint by its name or an equivalent name, such as left_wrist for LWrist.
+        """Return the index of a joint by its name, or by another spelling such as left_wrist for LWrist.
 
         Raises:
-            ValueError: the name is unknown; the message suggests the nearest one.
+            ValueError: no joint, or more than one joint, has this name; the message suggests the most similar name.
         """
         joint = str(joint)
         if joint in self.names:
@@ -207,19 +228,19 @@ class Skeleton:
 
     @property
     def edges(self) -> list[tuple[int, int]]:
-        """The bones as (parent, child), in the order of the children."""
+        """The bones as index pairs (parent, child), in the order of the children."""
         return [(parent, joint) for joint, parent in enumerate(self.parents) if parent != -1]
 
     @property
     def order(self) -> list[int]:
-        """The joints in breadth-first order, so that parents precede their children."""
+        """Indices of the joints in breadth-first order, so that parents precede their children."""
         tree = nx.DiGraph(self.edges)
         tree.add_node(self.root)
         return [joint for generation in nx.bfs_layers(tree, self.root) for joint in sorted(generation)]
 
     @property
     def offsets(self) -> Tensor:
-        """The rest pose (J, 3), float64.
+        """The rest pose: offset (J, 3) of each joint from its parent in metres, zero for the root, in float64.
 
         Raises:
             ValueError: the skeleton has no rest pose.
@@ -241,14 +262,21 @@ class Skeleton:
         return torch.cat([joints[..., : self.root, :], joints[..., self.root + 1 :, :]], -2)
 
     def with_root(self, joints: Tensor, value: float = 0.0) -> Tensor:
-        """Return joints (..., J, 3); if the root is missing, insert it with the given value."""
+        """Return joints (..., J, 3); if the root is missing, insert it with the given value in all coordinates."""
         if joints.shape[-2] == self.joints:
             return joints
         root = torch.full_like(joints[..., :1, :], value)
         return torch.cat([joints[..., : self.root, :], root, joints[..., self.root :, :]], -2)
 
     def bone_lengths(self, positions: Any) -> Any:
-        """Return bone lengths (..., J - 1), ordered as `edges`, of positions (..., J, 3), numpy or torch, in metres."""
+        """Return bone lengths (..., J - 1) in the order of `edges`, in the unit of the positions.
+
+        Args:
+            positions: array or tensor (..., J, 3) of joint positions.
+
+        Raises:
+            ValueError: the positions have another shape.
+        """
         if positions.shape[-2:] != (self.joints, 3):
             raise ValueError(
                 f"positions have shape {tuple(positions.shape)}, expected (..., {self.joints}, 3) for "
@@ -265,7 +293,8 @@ class Skeleton:
         """Return vectors (..., J - 1, 3) from parent to child in metres, in the order of `edges`.
 
         Args:
-            poses: (..., D), concatenated joint positions, D = 3 J; or D = 3 (J - 1) without the root at the origin.
+            poses: (..., D), concatenated joint positions in metres: D = 3 J, or D = 3 (J - 1) if the root is at the
+                origin and left out.
 
         Raises:
             ValueError: D has another value.
@@ -279,7 +308,7 @@ class Skeleton:
         """Return the end points of chained limbs with the root at the origin; the inverse of `limbs`.
 
         Args:
-            limbs: (..., J - 1, 3), in the order of `edges`.
+            limbs: (..., J - 1, 3) vectors from parent to child, in the order of `edges`.
 
         Returns:
             Poses (..., 3 (J - 1)), without the root.
@@ -300,7 +329,7 @@ class Skeleton:
 
     @property
     def sides(self) -> tuple[list[int], list[int]]:
-        """The joints where the left and right chains leave the trunk: hips and shoulders.
+        """Indices of the joints where the left and the right limbs leave the trunk: hips and shoulders.
 
         Raises:
             ValueError: the skeleton does not define left and right.
@@ -308,21 +337,23 @@ class Skeleton:
         left = [joint for joint in self.left if self.parents[joint] not in self.left]
         right = [joint for joint in self.right if self.parents[joint] not in self.right]
         if not left or not right:
-            raise ValueError(f"skeleton {self.name!r} has no left and right joints, so headings are not defined")
+            raise ValueError(
+                f"skeleton {self.name!r} has no left and right joints, so it has no heading; give `left` and `right`"
+            )
         return left, right
 
     def heading(self, positions: Tensor) -> Tensor:
         """Return the angle about the up axis, in radians, of the direction that a person faces.
 
-        The left-right axis is the sum over the left joints of `sides` minus the sum over the right joints. Heading zero
-        has the left side towards +x: facing +z if y is up, -y if z is up.
+        The left-right axis is the sum over the left joints of `sides` minus the sum over the right joints. At heading
+        zero, the left side points towards +x, so the person faces +z if y is up, and -y if z is up.
 
         Args:
-            positions: (..., J, 3); NaN sides are ignored.
+            positions: (..., J, 3); joints of `sides` that are NaN are ignored.
 
         Returns:
-            Angles (...,), NaN if all joints of a side are NaN. `rotate_about_up(positions, -heading, up)` gives
-            everybody heading zero.
+            Angles (...,), NaN if all joints of a side are NaN. `rotate_about_up(positions, -heading[..., None], up)`
+            rotates every pose to heading zero.
 
         Raises:
             ValueError: the skeleton does not define left and right.
@@ -358,7 +389,7 @@ class Skeleton:
 
     @staticmethod
     def _side(places: Tensor) -> Tensor:
-        """Sum positions (..., n, 2) to (..., 2); NaN positions count as the mean of the others."""
+        """Return the sum (..., 2) of positions (..., n, 2), where NaN positions count as the mean of the others."""
         is_known = places.isfinite().all(-1, keepdim=True)
         total: Tensor = torch.where(is_known, places, 0.0).sum(-2) * (is_known.shape[-2] / is_known.sum(-2))
         return total
@@ -420,7 +451,10 @@ SHORTEST = 1e-6
 
 
 def inverse_lengths(vectors: Tensor, dim: int = -1) -> Tensor:
-    """Return the inverse lengths of vectors along a dimension; zero, without gradient, for vectors of length zero."""
+    """Return the inverse lengths of vectors along a dimension.
+
+    For vectors shorter than `SHORTEST`, they are zero and have no gradient.
+    """
     squares = vectors.square().sum(dim)  # linalg.vector_norm is ten times slower over three numbers
     return squares.clamp_min(SHORTEST**2).rsqrt().masked_fill(squares < SHORTEST**2, 0)
 
@@ -432,8 +466,14 @@ def differences(
 ) -> Tensor:
     """Return the matrix (D, 3 P) that maps poses (..., D) to the vectors between the joints of P pairs.
 
-    Coordinates are ordered as in poses, xyz of the first pair first. One matrix product is ten times as fast as
-    gathering both ends and subtracting (measured: 200,000 poses of 48 numbers, forward and backward).
+    The vectors are concatenated: x, y and z of the first pair, then of the second. One matrix product is ten times as
+    fast as gathering both ends and subtracting (measured: 200,000 poses of 48 numbers, forward and backward).
+
+    Args:
+        skeleton: skeleton of the poses.
+        pairs: indices (from, to) of the joints of each pair.
+        size: D.
+        dtype, device: dtype and device of the matrix, which is cached and shared.
 
     Raises:
         ValueError: D is neither 3 J nor 3 (J - 1), which means that the root is at the origin and left out.
@@ -456,14 +496,20 @@ def differences(
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _chains(skeleton: Skeleton, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the inverse (D, D) of `differences` for all bones: a joint is the sum of the bones up to it."""
+    """Return the inverse (D, D) of `differences` for all bones: a joint is the sum of the bones from the root to it."""
     bones = differences(skeleton, tuple(skeleton.edges), 3 * (skeleton.joints - 1), torch.float64, torch.device("cpu"))
     chains: Tensor = torch.linalg.inv(bones).round().to(device, dtype)
     return chains
 
 
 def rotate_about_up(positions: Tensor, angle: Tensor, up: str) -> Tensor:
-    """Rotate positions (..., 3) about the up axis by angles in radians that broadcast against (...)."""
+    """Return positions (..., 3) rotated about the up axis.
+
+    Args:
+        positions: (..., 3).
+        angle: angles in radians, which broadcast against (...); positive is counterclockwise seen from above.
+        up: up axis, "y" or "z".
+    """
     vertical = "xyz".index(up)
     first, second = (vertical + 1) % 3, (vertical + 2) % 3
     cos, sin = torch.cos(angle), torch.sin(angle)
@@ -490,7 +536,7 @@ HUMAN36M = Skeleton(
 """The 17 joints of Human3.6M that papers use, as in VideoPose3D's archive: z up, 50 Hz."""
 
 HUMAN36M_KEPT = (0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 17, 18, 19, 25, 26, 27)
-"""Indices of these 17 joints among the archive's 32; `read_motion` selects them from an archive of 32."""
+"""Indices of the joints of `HUMAN36M` among the 32 joints of that archive; `read_motion` selects these joints."""
 
 # fmt: off
 HUMANEVA = Skeleton(
@@ -509,4 +555,4 @@ HUMANEVA = Skeleton(
 """HumanEva-I's 15 joints: z up, 60 Hz."""
 
 WALKER = Skeleton(HUMAN36M.names, HUMAN36M.parents, HUMAN36M.left, HUMAN36M.right, "y", 30.0, "walker")
-"""The simulator's skeleton: Human3.6M's tree, y up, 30 Hz."""
+"""The skeleton of `simulate`: the joints of `HUMAN36M`, with y up, 30 Hz."""

@@ -29,9 +29,8 @@ ROTATIONS = "rotations"
 class Heading(View):
     """Windows rotated about the up axis so that one of their poses has heading zero.
 
-    The original and the rotated window differ by a rotation, which preserves volumes, lengths and angles. The heading
-    itself is not modelled. Bounds are therefore bounds of rotated windows: compare them only with models that rotate
-    windows by the same pose.
+    A rotation preserves volumes, lengths and angles. The heading itself is not modelled, so bounds are bounds of the
+    rotated windows. Compare them only with models that rotate windows by the heading of the same pose.
 
     Missing values stay missing. The two horizontal coordinates of a joint must be both observed or both missing,
     because a rotation mixes them. If hips or shoulders are missing in the pose, the heading comes from the nearest
@@ -40,8 +39,8 @@ class Heading(View):
 
     Args:
         skeleton: skeleton with left and right joints.
-        frames: number of frames O; the pose is the last of the first O frames, or of a shorter window.
-        pose: variable (B, D) that is the pose; None for a frame of x.
+        frames: number of frames O; the pose is frame O of x, or the last frame of a shorter window.
+        pose: name of a variable (B, D) that is the pose; None for a frame of x.
         turned: names of the variables to rotate, (..., B, T, D) with D = 3 J, or 3 (J - 1) without the root at the
             origin.
     """
@@ -68,8 +67,8 @@ class Heading(View):
                 shortest, required = data.lengths.min(), min(self.frames, data[WHOLE].shape[-2])
                 if shortest < required:
                     raise ValueError(
-                        f"this model rotates every window by the heading in its frame {required}, but a sequence has "
-                        f"{shortest}; remove it, or fit with heading=False"
+                        f"this model rotates every window by the heading in frame {required}, but a sequence has only "
+                        f"{shortest} frames; remove the sequence, or fit with heading=False"
                     )
             heading = self._observed_heading(values)
         return self._rotate_all(values, -heading) | {HEADING: heading}
@@ -81,7 +80,10 @@ class Heading(View):
         return data if heading is None else self._rotate_all(data, heading)
 
     def of(self, x: Tensor) -> Tensor:
-        """Return headings (...) of windows (..., T, D), or of poses (..., D); unobserved joints are NaN."""
+        """Return headings (...) in radians of windows (..., T, D), or of poses (..., D) if `pose` is set.
+
+        Coordinates of unobserved joints are NaN.
+        """
         frames = x[..., None, :] if self.pose else x
         return self.skeleton.heading_near(self._joints(frames), min(self.frames, frames.shape[-2]) - 1)
 
@@ -97,7 +99,7 @@ class Heading(View):
         return rotate_about_up(x.unflatten(-1, (-1, 3)), angle[(..., *[None] * dims)], self.skeleton.up).flatten(-2)
 
     def _observed_heading(self, data: Batch) -> Tensor:
-        """Return headings (B,) computed from observed values."""
+        """Return headings (B,) in radians, computed from observed values only."""
         source = self.pose or WHOLE
         x, mask = data[source], data.mask(source)
         return self.of(x if mask is None else torch.where(mask, x, torch.nan))
@@ -107,8 +109,8 @@ class Heading(View):
         sizes = 3 * self.skeleton.joints, 3 * self.skeleton.joints - 3
         if poses.shape[-1] not in sizes:
             raise ValueError(
-                f"{self.pose or WHOLE} has shape {tuple(poses.shape)}; poses of the skeleton {self.skeleton.name!r} "
-                f"have {sizes[0]} coordinates, or {sizes[1]} without the root"
+                f"{self.pose or WHOLE} has shape {tuple(poses.shape)}, but poses of the skeleton "
+                f"{self.skeleton.name!r} have {sizes[0]} coordinates, or {sizes[1]} without the root"
             )
         return self.skeleton.with_root(poses.unflatten(-1, (-1, 3)))
 
@@ -123,8 +125,8 @@ class Heading(View):
                 n for j, n in enumerate(skeleton.names) if j != skeleton.root or mixed.shape[-1] == skeleton.joints
             ]
             raise ValueError(
-                f"window {window} is missing one horizontal coordinate of {names[joint]} and has the other, but this "
-                "model rotates windows, which mixes them; hide both in 'mask', or fit with heading=False"
+                f"window {window} is missing only one of the two horizontal coordinates of {names[joint]}, but this "
+                "model rotates windows, which mixes both; mark both as missing in 'mask', or fit with heading=False"
             )
 
 
@@ -132,19 +134,20 @@ class Heading(View):
 class Bones(View):
     """Unit vectors along the bones instead of positions; the inverse restores the observed bone lengths.
 
-    The direction of the bone that ends at a joint replaces the coordinates of this joint; a root that the protocol
-    keeps is not changed. The inverse rescales any output of the model to the bone lengths, so that they are correct by
-    construction.
+    The direction of the bone that ends at a joint replaces the coordinates of this joint. If x contains the root, its
+    coordinates are not changed. The inverse rescales any output of the model to the bone lengths, so that they are
+    correct by construction.
 
     This view is not a bijection. Lengths are given, one per bone and window, so their variation within a window is
     lost. A direction has two degrees of freedom in three numbers, so a density of directions does not define one of
     positions, and `log_det` raises an error. Use this view for models whose x is a function of its parents, as with
-    `distributions.Directions`, and that are trained by energies.
+    `distributions.Directions`. They are trained by energies instead of bounds.
 
     Args:
         skeleton: skeleton of the poses.
         frames: number of frames O; lengths are means over the first O frames, or over all frames if there are fewer.
-        pieces: subsets of the coordinates of x that batches and forecasts contain under their own names, as positions.
+        pieces: {name: indices of coordinates of x}, for parts of x that batches and forecasts contain as variables of
+            their own, in positions.
     """
 
     skeleton: Skeleton
@@ -186,7 +189,7 @@ class Bones(View):
         raise ValueError(
             "a model that sees the directions of bones has no density of positions: lengths are given, and a direction "
             "has two degrees of freedom in three numbers. Make x a function of its parents with "
-            "distributions.Directions() and train by energies, or let the model see positions"
+            "distributions.Directions() and train by energies, or fit with bones=False"
         )
 
     def _with_root(self, joints: Tensor, x: Tensor) -> Tensor:
@@ -203,7 +206,11 @@ class Bones(View):
         return values | pieces | ({WHOLE: x} if WHOLE in values else {})
 
     def _assemble(self, data: Batch, pieces: Mapping[str, Sequence[int]]) -> Tensor:
-        """Return x assembled from pieces, 0 elsewhere; the start of each bone must be the root or in a piece."""
+        """Return x assembled from pieces, 0 elsewhere.
+
+        Raises:
+            ValueError: the parent of a joint is neither the root nor in a piece.
+        """
         size = 1 + max(index for places in self.pieces.values() for index in places)
         joints = [j for j in range(self.skeleton.joints) if j != self.skeleton.root or size == 3 * self.skeleton.joints]
         known_joints = {joints[index // 3] for places in pieces.values() for index in places} | {self.skeleton.root}
@@ -213,8 +220,8 @@ class Bones(View):
             names, parent = self.skeleton.names, self.skeleton.parents[undetermined[0]]
             raise ValueError(
                 f"this model sees the directions of bones, but {', '.join(pieces)} alone does not determine the "
-                f"direction of {names[undetermined[0]]}, whose parent is {names[parent]}; give the part with "
-                f"{names[parent]} too"
+                f"direction of {names[undetermined[0]]}, whose parent is {names[parent]}; also give the part that "
+                f"contains {names[parent]}"
             )
         first_piece: Tensor = data[next(iter(pieces))]
         x = first_piece.new_zeros(*first_piece.shape[:-1], size)
@@ -236,7 +243,7 @@ class Bones(View):
                 window, frame, *_ = (~mask).nonzero()[0].tolist()
                 raise ValueError(
                     f"window {window} has missing entries in frame {frame + 1}, but this model sees the directions of "
-                    "bones, which need both ends; fill them first, or fit with bones=False"
+                    "bones, which need both ends; impute these entries first, or fit with bones=False"
                 )
 
 
@@ -246,11 +253,11 @@ class Rotations(View):
 
     Outside the model, x is positions (B, T, D) in metres. The model sees the position of the root, if x has it, and
     then the rotation of every joint with children, in `form` and without jumps (`rotations.in_time`). Rotations come
-    from the data, or else from `kinematics.inverse`, which also estimates the twist. Bones have their mean length in
-    the data, or their length in the rest pose if data are unavailable.
+    from the data if these contain them, and otherwise from `kinematics.inverse`, which also estimates the rotation of a
+    bone about itself. Each bone has its mean length in the window, or its length in the rest pose if no data are given.
 
-    Densities are densities of these numbers, not of positions, which have other volumes and one more dimension per
-    bone. Compare bounds only with models that use the same view.
+    Densities are densities of these numbers, not of positions, since the conversion changes volumes and the number of
+    degrees of freedom. Compare bounds only with models that use the same view.
 
     Args:
         skeleton: skeleton with a rest pose.
@@ -280,7 +287,7 @@ class Rotations(View):
 
     @property
     def turning(self) -> list[int]:
-        """The joints with children; the rotations of all others are not observable."""
+        """Indices of the joints with children; the rotation of any other joint changes no position."""
         return sorted({parent for parent, _ in self.skeleton.edges})
 
     @property
@@ -296,8 +303,8 @@ class Rotations(View):
         x, skeleton = data[WHOLE], self.skeleton
         if x.shape[-1] != 3 * (skeleton.joints - (not self.root)):
             raise ValueError(
-                f"x has shape {tuple(x.shape)}; positions of the skeleton {skeleton.name!r} have "
-                f"{3 * (skeleton.joints - (not self.root))} numbers"
+                f"x has shape {tuple(x.shape)}, but positions of the skeleton {skeleton.name!r} have "
+                f"{3 * (skeleton.joints - (not self.root))} numbers in the last dimension, for root={self.root}"
             )
         if data.mask() is not None:
             raise ValueError(

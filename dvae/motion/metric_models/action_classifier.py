@@ -44,7 +44,7 @@ class ActionClassifier(Trainable):
     """A classifier of actions, for the scores ACC and FID.
 
     Args:
-        label: label of the clips that is the class.
+        label: name of the clip label that gives the class.
         hidden: number of units of the GRU.
         layers: number of layers of the GRU.
         features: number of features.
@@ -61,7 +61,7 @@ class ActionClassifier(Trainable):
     classes: tuple[str, ...] = ()
 
     def resolve_defaults(self, windows: Windows) -> ActionClassifier:
-        """Return the method with its classes, by default the classes of clips that have a window.
+        """Return the method with its classes, by default those of all clips that are long enough for a window.
 
         Raises:
             ValueError: there are fewer than two classes.
@@ -69,18 +69,22 @@ class ActionClassifier(Trainable):
         if self.classes:
             return self
         if not isinstance(windows, Windows):
-            raise SchemaError("an action classifier needs to know the classes; give windows whose clips have them")
+            raise SchemaError(
+                "an action classifier reads the classes from the labels of clips, but the data have no clips; pass "
+                "`dvae.motion.windows`"
+            )
         classes = sorted({clip.labels[self.label] for clip in windows.clips if self.label in clip.labels})
         if len(classes) < 2:
             labels = sorted({label for clip in windows.clips for label in clip.labels})
             raise ValueError(
-                f"a classifier needs two classes: training clips have {' and '.join(classes) or 'nothing'} for the "
-                f"label {self.label!r}; labels are {', '.join(labels) or 'none (is labels.csv next to the file?)'}"
+                f"a classifier needs at least two classes: training clips have {' and '.join(classes) or 'nothing'} "
+                f"for the label {self.label!r}; "
+                f"labels are {', '.join(labels) or 'none (is labels.csv next to the file?)'}"
             )
         return replace(self, classes=tuple(classes))
 
     def build(self, data: Any) -> ActionClassifierModel:
-        """Return the model for these windows; a schema alone does not contain the classes."""
+        """Return the model for windows. A schema is not sufficient, because it does not contain the classes."""
         schema = Poses.of(data, "an action classifier")
         method = self if self.classes else self.resolve_defaults(data)
         return ActionClassifierModel(method, schema.skeleton, schema.sizes["x"], schema.protocol)
@@ -142,7 +146,7 @@ class ActionClassifierModel(nn.Module):
         return {}
 
     def forward(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
-        """Run the program, for bounds."""
+        """Run `model`, as bounds do."""
         return self.model(batch, **options)
 
     def features(self, futures: Tensor) -> Tensor:

@@ -56,8 +56,8 @@ class PosePrior(Trainable):
         noise: standard deviation in metres of the noise added to each coordinate of training poses; 0 in the paper.
         turned: rotate every training window about the up axis by a uniform angle, for a prior that ignores headings.
             Not needed if the heading of the windows is fixed.
-        heading: rotate every window about the up axis so that its last observed frame has heading zero, for a prior of
-            models that do the same.
+        heading: rotate every window about the up axis so that its last observed frame has heading zero, for a prior
+            that trains models of windows rotated in this way.
         whiten: standardise directions by their mean and covariance over training poses; the paper does not, and needs a
             learning rate of .01.
     """
@@ -79,7 +79,7 @@ class PosePrior(Trainable):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.turned and self.heading:
-            raise ValueError("heading fixes the direction that turned would draw; choose one")
+            raise ValueError("`heading` fixes the direction that `turned` draws at random; set only one")
 
     def build(self, data: Any) -> PosePriorModel:
         """Return the model for poses of the data's skeleton."""
@@ -169,7 +169,7 @@ class PosePriorModel(nn.Module):
         return self.model(given, **options) if isinstance(given, Mapping) else self.flow.to_noise(given)
 
     def facing(self, x: Tensor) -> Tensor:
-        """Return windows (..., T, D), rotated as the density requires."""
+        """Return windows (..., T, D), rotated so that frame `forward_at` has heading zero if it is set."""
         return x if self.forward_at is None else Heading(self.skeleton, self.forward_at + 1).face(x)
 
     def log_prob(self, poses: Tensor) -> Tensor:
@@ -182,7 +182,7 @@ class PosePriorModel(nn.Module):
 
     @torch.no_grad()
     def sample(self, count: int) -> Tensor:
-        """Draw limb directions (count, 3 (J - 1)); the density covers all vectors, so their lengths vary about 1."""
+        """Draw limb directions (count, 3 (J - 1)); lengths vary around 1, because the density is over all vectors."""
         return self.flow.prior().sample((count,))
 
 
@@ -242,8 +242,8 @@ def load_pose_prior(path: str | Path, skeleton: Skeleton, heading: bool) -> Pose
         raise ValueError(f"{path} does not contain a pose prior of the skeleton {skeleton.name!r}")
     if recorded_options != (heading, PosePrior.layers):
         raise ValueError(
-            f"{path} was fitted with heading={options['heading']} and layers={options['layers']}, but this model sees "
-            f"poses with heading={heading}, and takes a prior of {PosePrior.layers} layers"
+            f"{path} was fitted with heading={options['heading']} and layers={options['layers']}, but this model needs "
+            f"a prior with heading={heading} and layers={PosePrior.layers}; fit one with these options"
         )
     model = PosePriorModel(skeleton)
     load_weights(model, path)

@@ -22,7 +22,7 @@ in a batch, 25,000 windows of each kind. Our changes:
 * All futures come from the final model, one per window, and are means of the emission. The paper uses futures from
   different training steps; early ones are easier to detect.
 * The width is an option, 128 by default; the layers have half and an eighth of it, as in the paper.
-* The input are positions relative to the pelvis, without the pelvis. Each window is rotated so that its last observed
+* The inputs are positions relative to the pelvis, without the pelvis. Each window is rotated so that its last observed
   frame has heading zero, because headings must not reveal the class. The paper specifies neither.
 * Values are standardised by the mean and scale of the real training windows.
 """
@@ -159,11 +159,11 @@ class RealOrGeneratedModel(nn.Module):
         return {}
 
     def forward(self, batch: Batch, **options: Any) -> dict[str, Tensor]:
-        """Run the program, for bounds."""
+        """Run `model`, as bounds do."""
         return self.model(batch, **options)
 
     def seen(self, x: Tensor) -> Tensor:
-        """Return the input (..., T, 3 (J - 1)) from windows (..., T, D), with the pelvis or without.
+        """Return the input (..., T, 3 (J - 1)) of the classifier for windows (..., T, D) with or without the pelvis.
 
         Raises:
             ValueError: the windows have another skeleton.
@@ -191,7 +191,7 @@ class Examples:
     """Windows with their real futures, and windows with generated futures.
 
     Args:
-        real, generated: (N, T, D).
+        real, generated: windows (N, T, D) with real and with generated futures.
     """
 
     real: Tensor
@@ -220,8 +220,8 @@ class QualityScores(Result):
     with seeds of the classifier (`dvae.inference.evaluation.comparison`).
 
     Attributes:
-        rows: `{model: {score: (S, C)}}`, by seed of the classifier and clip.
-        clips: `{"split/clip": number of its windows}`, in the order of C.
+        rows: `{model: {score: values (S, C)}}`, for S seeds of the classifier and C clips.
+        clips: `{"split/clip": number of its windows}`, in the order of the C clips.
         record: settings of the evaluation.
     """
 
@@ -238,7 +238,9 @@ class QualityScores(Result):
 
     def _parts(self, model: str, score: str) -> TwoWayErrors:
         if model not in self.rows:
-            raise KeyError(f"no model {model!r} here{nearest(model, self.rows)}; there are {', '.join(self.rows)}")
+            raise KeyError(
+                f"no model {model!r} in these scores{nearest(model, self.rows)}; there are {', '.join(self.rows)}"
+            )
         return TwoWayErrors.of(self.rows[model][score], np.array(list(self.clips.values())))
 
     @override
@@ -265,7 +267,7 @@ class QualityScores(Result):
     @override
     def check(self) -> None:
         if self.extents.get("clip") != {len(self.clips)} or any(row.keys() != {*SCORES} for row in self.rows.values()):
-            raise ValueError(f"expected {', '.join(SCORES)} of {len(self.clips)} clips")
+            raise ValueError(f"every model needs the scores {', '.join(SCORES)} for all {len(self.clips)} clips")
         self.table()
 
 
@@ -290,10 +292,10 @@ def quality(
     progress: bool = True,
     **training: Any,
 ) -> QualityScores:
-    """Evaluate how well the futures of models pass for real, by classifiers that are fitted to each model.
+    """Evaluate how hard it is to distinguish the futures of models from real motion.
 
-    Each model has one classifier per seed; they differ in their initial weights and in their batches. All classifiers
-    of a model use the same futures.
+    Classifiers are fitted for each model, one per seed. They differ in their initial weights and in their batches. All
+    classifiers of a model use the same futures.
 
     Args:
         models: models by name, with a `forecast` as in `dvae.program.protocols.Forecasting`, fitted without test clips.
@@ -305,9 +307,9 @@ def quality(
         seeds: seeds of the classifiers.
         seed: seed of windows and futures.
         forecast: options of the models' `forecast`.
-        references: whether to include zero velocity, which any trained classifier should detect.
+        references: whether to include the zero-velocity baseline, which any trained classifier should detect.
         progress: whether to show progress bars.
-        **training: options of `Training`; override `TRAINING`.
+        **training: options of `Training`, which override the defaults in `TRAINING`.
 
     Raises:
         ValueError: the windows have missing joints, or differ in protocol or skeleton; there is no seed or example; or
@@ -316,13 +318,13 @@ def quality(
     """
     method = method or RealOrGenerated()
     if train.missing or test.missing:
-        raise ValueError("quality needs whole windows, but these have missing joints; fill the gaps (`dvae impute`)")
+        raise ValueError("quality needs whole windows, but these have missing joints; fill them in (`dvae impute`)")
     if (train.skeleton, train.protocol.observed, train.length) != (test.skeleton, test.protocol.observed, test.length):
         raise ValueError(f"training and test windows differ in skeleton or frames: {train} and {test}")
     if examples < 1 or not seeds:
         raise ValueError(f"quality needs at least one example and one seed, got {examples} and {list(seeds)}")
     if references and STILL in models:
-        raise ValueError(f"a model must not have the name of a reference row: {STILL}")
+        raise ValueError(f"the name {STILL!r} is reserved for the zero-velocity baseline; rename the model")
     test_windows, clips = prepare_windows(test), clip_index(test.keys)
     batch = train.sample(examples, torch.Generator().manual_seed(seed))
     train_windows = EvaluationWindows(
@@ -365,7 +367,7 @@ def quality(
 
 
 def _forecaster(model: Any, horizon: int, options: Mapping[str, Any]) -> Callable[[Batch], Tensor]:
-    """Return a function from pasts to one future of each."""
+    """Return a function that draws one future of each past in a batch."""
 
     def futures(past: Batch) -> Tensor:
         forecasts = model.forecast(on_device_of(model, past), horizon, 1, **{"draw_emission": False, **options})
@@ -376,7 +378,7 @@ def _forecaster(model: Any, horizon: int, options: Mapping[str, Any]) -> Callabl
 
 
 def _examples(name: str, forecast: Callable[[Batch], Tensor], windows: EvaluationWindows, progress: bool) -> Examples:
-    """Return windows, and their versions with futures of a model."""
+    """Return windows, and the same windows with their futures replaced by futures of a model."""
     generated = []
     with progress_bar(progress) as bar:
         for start in bar.track(range(0, len(windows.keys), 256), description=f"{name}, forecasts"):

@@ -70,7 +70,7 @@ def draw_traversal(
     """Draw poses of one sequence at one frame, one row per latent coordinate, the one with the largest effect first.
 
     Args:
-        found: result of `dvae.traverse`.
+        found: traversal of the latent coordinates, returned by `dvae.traverse`.
         windows: windows of the skeleton; `positions` converts x to poses.
         frame: index of the frame, the last by default.
         sequence: index of the sequence in the batch.

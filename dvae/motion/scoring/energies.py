@@ -43,15 +43,16 @@ def best_of_many(samples: Tensor, truth: Tensor) -> Tensor:
 
 
 def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> Tensor:
-    """Return the squared error of the best sample for each admissible future: min_s sum_{t,d} (x_s - y_m)^2, pooled.
+    """Return the squared error of the best sample for each admissible future: min_s sum_{t,d} (x_s - y_m)^2.
 
-    e_b = (B / M) sum over the valid futures of b, with M valid futures in the whole batch. The mean over the batch is
-    therefore the mean over all valid futures. GSPS's multimodal reconstruction term L_mm.
+    The errors of a sequence are summed over its valid futures and multiplied by B / N, where N is the number of valid
+    futures in the whole batch. The mean over the batch is therefore the mean over all valid futures. GSPS's multimodal
+    reconstruction term L_mm.
 
     Args:
         samples: (S, B, T, D).
-        pseudo: (B, M, T, D), admissible futures; invalid ones are ignored.
-        valid: (B, M) bool.
+        pseudo: (B, M, T, D), admissible futures.
+        valid: (B, M) bool, False for futures to ignore.
 
     Returns:
         (B,), square metres; zeros if no future is valid.
@@ -90,7 +91,7 @@ def pairwise_diversity(samples: Tensor, scale: float) -> Tensor:
 
     Args:
         samples: (S, B, T, D).
-        scale: alpha, metres; the distance is the sum over all T D coordinates.
+        scale: length scale alpha in metres; the distance is the sum over all T D coordinates.
 
     Returns:
         (B,), from 0 to 1 (all samples equal); zeros if there is only one sample.
@@ -118,7 +119,7 @@ def gaussian_diversity(samples: Tensor, scale: float) -> Tensor:
 
     Args:
         samples: (S, B, T, D).
-        scale: square metres.
+        scale: scale of the squared distance, in square metres.
 
     Returns:
         (B,), from 0 to 1 (all samples equal); zeros if there is only one sample.
@@ -139,8 +140,8 @@ def determinantal_diversity(samples: Tensor, quality: Tensor, scale: float) -> T
 
     Args:
         samples: (S, B, T, D).
-        quality: (S, B), r.
-        scale: square metres.
+        quality: (S, B), quality r of each sample.
+        scale: scale of the squared distance, in square metres.
 
     Returns:
         (B,), from -S to 0.
@@ -273,7 +274,7 @@ def joint_angles(samples: Tensor, limits: AngleLimits, skeleton: Skeleton) -> Te
     names = angle_names(skeleton)
     if limits.names != names:
         raise ValueError(
-            f"limits of the angles {', '.join(dict.fromkeys(limits.names))}; expected the angles of skeleton "
+            f"`limits` has the angles {', '.join(dict.fromkeys(limits.names))}; expected the angles of skeleton "
             f"{skeleton.name!r}, {', '.join(dict.fromkeys(names))}: estimate the limits from its poses"
         )
     low, high = limits.low.to(samples), limits.high.to(samples)
@@ -323,7 +324,7 @@ def _poses_at_once(samples: Tensor) -> int:
 
 
 def pose_prior_energy(samples: Tensor, prior: Callable[[Tensor], tuple[Tensor, Tensor]], skeleton: Skeleton) -> Tensor:
-    """Return the distance of poses from a prior's centre: -mean_{t,s} sum log N(z; 0, 1), z of unit limb directions.
+    """Return the distance of poses from a prior's centre: -mean_{t,s} sum log N(z; 0, 1), z = flow(limb directions).
 
     GSPS's L_nf. As in GSPS, the log-determinant of the prior's flow is left out, so this is not a density.
 

@@ -54,7 +54,7 @@ _FURTHER |= {
 
 
 def parts(names: Sequence[str]) -> dict[str, int]:
-    """Map parts to joints, as in {"pelvis": 0, "l hip": 1}; joints that match no part are left out."""
+    """Map body parts to indices of joints, as in {"pelvis": 0, "l hip": 1}; joints that match no part are left out."""
     words: dict[tuple[str, str], int] = {}
     for joint, name in enumerate(names):
         for reading in readings(name):
@@ -88,7 +88,7 @@ def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | No
     Args:
         names: names of a file's joints.
         skeleton: skeleton whose joints are matched.
-        said: mapping from names in the file to names in the skeleton, if names alone are not sufficient.
+        said: mapping from names in the file to names in the skeleton, for joints whose names do not match.
 
     Raises:
         ValueError: some joints have no match.
@@ -113,7 +113,7 @@ def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | No
         raise ValueError(
             f"no joint matches {', '.join(unmatched)} of skeleton {skeleton.name!r}; there are "
             f"{', '.join(names)[:600]}. Match them with "
-            'joints={"name there": "name here", ...}'
+            'joints={"name in the file": "name in the skeleton", ...}'
         )
     return [index for index in matches if index is not None]
 
@@ -177,7 +177,7 @@ class JointSubset:
         for joint in joints:
             index = find(names, joint) if isinstance(joint, str) else joint
             if not 0 <= index < len(names) or index in selected:
-                raise ValueError(f"joint {joint!r} is not one of {len(names)}, or occurs twice")
+                raise ValueError(f"joint {joint!r} is not one of the {len(names)} joints, or is selected twice")
             selected.append(index)
         parents_of = []
         for index in selected:
@@ -188,7 +188,7 @@ class JointSubset:
         roots = [names[joint] for joint, parent in zip(selected, parents_of, strict=True) if parent < 0]
         if len(roots) != 1:
             raise ValueError(
-                f"the joints that are kept need one common ancestor among them, such as the pelvis; their roots are "
+                "one of the kept joints must be an ancestor of all others, such as the pelvis; now there are the roots "
                 f"{', '.join(roots)[:600] or 'none'}"
             )
         return cls(tuple(selected), tuple(renamed or (names[joint] for joint in selected)), tuple(parents_of))

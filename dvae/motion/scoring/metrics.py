@@ -176,7 +176,7 @@ def cumulative_motion_distance(motion: Array, real: Array) -> Tensor:
     motion, real = torch.as_tensor(motion), torch.as_tensor(real)
     if motion.ndim != real.ndim + 1 or motion.shape[:-1] != real.shape or not motion.numel():
         raise ValueError(
-            "motion (..., T - 1), T at least 2, needs a pace (...) of true motion, not "
+            "`motion` must have shape (..., T - 1) with T at least 2, and `real` shape (...); got "
             f"{shape_of(motion)} and {shape_of(real)}"
         )
     frames = torch.arange(motion.shape[-1], 0, -1, device=motion.device)
@@ -235,7 +235,7 @@ def _multimodal(samples: Array, truths: Array) -> tuple[Tensor, Tensor]:
     without_count = truths.shape[:-3] + truths.shape[-2:]
     if truths.ndim < 3 or without_count != samples.shape[:-3] + samples.shape[-2:] or not truths.numel():
         raise ValueError(
-            f"samples (..., K, T, D) of shape {shape_of(samples)} need truths (..., M, T, D) that differ "
-            f"from them in M alone, M at least 1, not {shape_of(truths)}"
+            f"samples (..., K, T, D) have shape {shape_of(samples)}; expected truths (..., M, T, D) with M at least 1 "
+            f"and otherwise the same sizes, got {shape_of(truths)}"
         )
     return as_same_type(samples, truths)

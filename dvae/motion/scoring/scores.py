@@ -15,8 +15,8 @@ frames. As in the public code, it is computed for each class of motion, and aver
 number of windows. The class of a clip is its label "content"; without such labels, all windows form one class. The pace
 of a class is the pace of the true futures of the evaluated windows; the public code uses a constant for each of its
 data sets. CMD is one number for the whole set, with a jackknife over clips. Real motion does not score 0, because its
-pace varies. If joints are missing, a step of a joint counts only if the joint was observed in both frames, in futures
-as in the truth.
+pace varies. If joints are missing, a step of a joint counts only if the true joint was observed in both frames. The
+same steps are left out of the futures.
 
 Three scores measure the body: limb stretch, limb jitter and limb-angle error (SkeletonDiffusion: Curreli et al. 2025,
 arXiv:2501.06035, equation 13). Let l_t be the length of a limb in frame t of a future, and m its mean length over the
@@ -135,11 +135,11 @@ _MULTIMODAL = ("MMADE", "MMFDE", "MMADEm", "MMFDEm")
 def displacements(
     windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x, threshold: float | None = None
 ) -> list[Measure]:
-    """Return diversity, errors of the best and of the median future, and proper scores, in metres; also for arrays.
+    """Return diversity, errors of the best and of the median future, and proper scores.
 
     Args:
-        windows: windows for the multimodal ground truth. Exchanged windows have none, because windows that begin with
-            the exchanged pose have other paths.
+        windows: windows for the multimodal ground truth, of motion in metres or of any arrays. Exchanged windows have
+            none, because windows that begin with the exchanged pose have other paths.
         body: function that selects the compared part of frames (..., T, D).
         threshold: distance below which last observed frames count as the same, in the unit of the data; default: the
             protocol's `multimodal_threshold`, or else 0.5, as in the papers.
@@ -282,7 +282,7 @@ def _limbs(windows: Windows | ExchangedWindows, bones: list[int], note: str) -> 
         return lengths(forecasts) / mean_of_known(lengths(truth), -1)[..., None, None] - 1
 
     def of_errors(score: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
-        """Average a score (B, limbs, K) of relative errors over limbs and futures."""
+        """Return a measure that averages `score`, (B, limbs, K) of relative errors, over limbs and futures."""
         return lambda forecasts, truth, past, index: mean_of_known(score(relative(forecasts, truth)), (1, 2))
 
     scores: dict[str, Callable[[Tensor], Tensor]] = {
@@ -394,8 +394,8 @@ def _where_true(forecasts: Tensor, truth: Tensor) -> Tensor:
 def _pose_nll(prior: Any, observed: int) -> Measure:
     if prior.forward_at not in (None, observed - 1):
         raise ValueError(
-            f"the pose prior reads windows rotated at their frame {prior.forward_at + 1}, but here "
-            f"{observed} frames are observed; fit one under this protocol"
+            f"the pose prior was fitted to windows whose heading is zero in frame {prior.forward_at + 1}, but here the "
+            f"last observed frame is {observed}; fit a pose prior under this protocol"
         )
 
     @torch.no_grad()
@@ -414,7 +414,7 @@ def _classifier_scores(
     if windows.missing:
         raise ValueError(
             f"ACC and FID {name} need features of whole futures, but these windows have missing joints; leave the "
-            "classifier out, or fill the gaps first (`dvae impute RUN --filled FILE`)"
+            "classifier out, or fill them in first (`dvae impute RUN --filled FILE`)"
         )
     labels = _labels(name, classifier, windows)
     classes = torch.tensor([classifier.classes.index(label) if label in classifier.classes else -1 for label in labels])
@@ -469,8 +469,8 @@ def _labels(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> 
     clips = clip_index(windows.keys).bincount()
     if len(windows.keys) - (int(clips.max()) if len(clips) > 1 else 0) < 2:
         raise ValueError(
-            f"FID {name} needs normal fits to the features of at least two windows, also without any one clip; these "
-            f"are {len(windows.keys)} windows of {len(clips)} clips"
+            f"FID {name} fits normal distributions to features, and needs at least two windows when any one clip is "
+            f"left out; got {len(windows.keys)} windows of {len(clips)} clips"
         )
     try:
         return windows.labels(classifier.label)

@@ -57,14 +57,14 @@ class PseudoTruths:
     ) -> None:
         if not threshold > 0 or not minimum >= 0 or most < 1 or stride < 1:
             raise ValueError(
-                "expected a threshold above 0, a minimum of at least 0, and most and stride of at least 1; got "
+                "`threshold` must be above 0, `minimum` at least 0, and `most` and `stride` at least 1; got "
                 f"{threshold}, {minimum}, {most} and {stride}"
             )
         self._observed = windows.protocol.observed
         if windows.length <= self._observed:
             raise ValueError(
-                f"windows of {windows.length} frames, {self._observed} of them observed, have no future to exchange; "
-                "make them longer"
+                f"windows of {windows.length} frames, {self._observed} of them observed, have no future; use "
+                "longer windows"
             )
         self.threshold, self.minimum, self.most, self.heading = threshold, minimum, most, heading
         self._skeleton, self._windows = windows.skeleton, windows

@@ -17,13 +17,17 @@ in metres, for a person who starts at the origin with heading zero. Moments with
 time, with linear interpolation between the frames of chi. Moments with both are located at the frame, and their time is
 an observation.
 
-The paper adds squared errors with adaptive weights. Here they are negative log densities of normal distributions, and
-the `Deviations` act as weights. The minimum is therefore the mode of a posterior, which also gives the uncertainty of a
-completion. For points, the error is the distance of each point to the nearest vertex. It is one-sided: a vertex far
-from all points is not an error, because points may be few. This is not a density of points, so the evidence cannot
-compare bodies by points. The curvature of the posterior treats the nearest vertices as fixed, which overstates the
-information in points; k-hat shows this. The surface of a frame counts as one vertex, the mean of all, because errors of
-its vertices are correlated.
+The paper adds squared errors with adaptive weights. Here the squared errors are negative log densities of normal
+distributions, and the `Deviations` act as weights. The minimum of their sum is therefore the mode of a posterior, which
+also gives the uncertainty of a completion.
+
+For points, the error is the distance of each point to the nearest vertex. The error is one-sided: a vertex far from all
+points is not an error, because points may be few. These errors do not define a density of points, so the evidence
+cannot compare bodies by points. The curvature of the posterior treats the nearest vertices as fixed, which overstates
+the information in points; a high k-hat reveals this.
+
+The surface of a frame counts as a single vertex with the mean squared error of all vertices, because errors of
+neighbouring vertices are correlated.
 """
 
 from __future__ import annotations
@@ -50,11 +54,13 @@ from .frames import TimedFrames
 LATENT = "z"
 TIMES, FRAMES, SURFACES, POINTS, SPOTS = "times", "frames", "surfaces", "points", "markers"
 TIME = slice(-1, None)
-"""Coordinate of a frame that contains its time increment."""
+"""Slice of a frame's coordinates that selects its time increment."""
 NEAREST = "nearest"
 """Name of the indices (B, K, M) of the vertices nearest to points."""
 AT_ONCE, PAIRS = 32, 2**20
-"""Maximum number of frames with all vertices in memory; and of pairs of points and vertices per cache."""
+"""Maximum number of frames whose vertices are all in memory, and of pairs of a point and a vertex compared at once.
+
+The second is chosen so that the pairs fit into a processor's cache."""
 THIN = 16
 """Stride of the vertices used for a complete surface; a subset determines joints and shape equally well."""
 
@@ -65,13 +71,14 @@ class Deviations:
 
     They include the error of the decoder. Errors of neighbouring frames are correlated, but the likelihood assumes
     independent errors: verify the coverage of intervals on known segments. The defaults had the smallest vertex errors
-    on unseen styles (docs/results/motion_latent_4d.md).
+    on unseen styles (benchmarks/results/motion_latent_4d).
 
     Args:
-        surface: metres, for the surface of a frame as a whole.
-        point: metres, from a point to the nearest vertex, including half the distance between vertices.
-        marker: metres.
-        time: seconds, between a frame and its observed time, or between the end of a segment and later observations.
+        surface: deviation in metres of the surface of a frame as a whole.
+        point: deviation in metres of a point from the nearest vertex, including half the distance between vertices.
+        marker: deviation in metres of a marker.
+        time: deviation in seconds between the decoded and the observed time of a frame. For observations after the
+            decoded end of the segment, deviation between the end and their time.
     """
 
     surface: Positive = 0.02
@@ -83,7 +90,7 @@ class Deviations:
         check(self)
 
     def of(self, name: str) -> float:
-        """Return the deviation of "surfaces", "points" or "markers", in metres."""
+        """Return the standard deviation in metres of one kind of observation: "surfaces", "points" or "markers"."""
         return {SURFACES: self.surface, POINTS: self.point, SPOTS: self.marker}[name]
 
 
@@ -95,10 +102,12 @@ class SegmentCompletion:
         model: model of segments, such as `dvae.models.motion.motion_latent.MotionLatentModel`, with `decode`,
             `decoder`, `guide`, `timed` and `body`.
         deviations: standard deviations of the observations.
-        markers: (L,), vertices of the markers; default: `bodies.MARKERS`.
-        known: known segments (x and beta); the guide's latents for them are additional starting points.
-        aggregate: if segments are known, the prior of z is a normal distribution with the mean and covariance of their
-            aggregate posterior under the guide, instead of N(0, I). A small KL weight allows the two to differ.
+        markers: (L,), vertex index of each marker; default: `bodies.MARKERS`.
+        known: known segments, x (B, N, D) and beta (B, S). The search then also starts from the guide's latents for
+            these segments.
+        aggregate: whether to estimate the prior of z from `known`. The prior is then a normal distribution with the
+            mean and covariance of the guide's latents for all known segments, instead of N(0, I). The two differ if the
+            model was trained with a small KL weight. Without `known`, the prior is N(0, I).
     """
 
     model: Any
@@ -111,7 +120,7 @@ class SegmentCompletion:
         """Sample z from `prior` and beta from N(0, I), and score the observations given the decoded motion.
 
         Args:
-            seen: result of `read`. Nearest vertices are computed if they are not included.
+            seen: result of `read`. Vertices nearest to points are computed unless `renewed` has added them.
 
         Returns:
             z (B, Z) and beta (B, S).
@@ -156,13 +165,22 @@ class SegmentCompletion:
         return {name: (value - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, value in decoded.items()}
 
     def guide(self, seen: Mapping[str, Any]) -> Any:
-        """Sample z of random known segments."""
+        """Sample z from the model's guide for randomly chosen known segments, one for each observed segment.
+
+        Args:
+            seen: result of `read`; only the number of segments is used.
+        """
         assert self.known is not None
         rows = torch.randint(len(self.known["x"]), (len(next(iter(seen.values()))),))
         return self.model.guide({name: value[rows] for name, value in self.known.items()})
 
     def renewed(self, seen: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the observations with the vertices nearest to points for these values of the latents."""
+        """Return the observations with updated indices of the vertices nearest to points.
+
+        Args:
+            seen: result of `read`.
+            values: z (B, Z), and beta (B, S) unless it was observed; the points are compared with the decoded surfaces.
+        """
         if POINTS not in seen:
             return dict(seen)
         shape = values.get(SHAPE, seen.get(SHAPE))
@@ -186,7 +204,11 @@ class SegmentCompletion:
         return times, decoded
 
     def _at_moments(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-        """Return `_at_moments` of the decoded segments; only the needed frames are decoded."""
+        """Return the frames (B, K, D) of the decoded segments at the observed moments, and their times or indices.
+
+        Only the needed frames are decoded. The second result is the times (B, K) in seconds. If times were not observed
+        and all segments share whole frame indices, it is these indices instead, because times are not needed.
+        """
         frames, decode = seen.get(FRAMES), self.model.decoder(z, shape)
         if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
             return decode(frames[0].long()), frames
@@ -195,10 +217,15 @@ class SegmentCompletion:
     def read(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
         """Validate observations, and convert them to the model's precision and device.
 
-        Surfaces keep every `THIN`-th vertex.
+        Args:
+            seen: observations in the format of this module.
+
+        Returns:
+            The same observations as tensors; surfaces keep only every `THIN`-th vertex.
 
         Raises:
-            ValueError: a name is unknown, a shape is wrong, observations are empty, or one has no time.
+            ValueError: a name is unknown, a shape is wrong, observations are empty, an observation has neither time nor
+                frame, a frame is out of range, or beta is NaN in some segments.
         """
         tensors = {name: torch.as_tensor(value).to(like(self.model)) for name, value in seen.items()}
         body, kinds = self.model.body, [name for name in (SURFACES, POINTS, SPOTS) if name in tensors]
@@ -258,7 +285,7 @@ class Completed:
         return self.program.model
 
     def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> IWAEBound:
-        """Return the log evidence of the observations, and k-hat, by `Posterior.evidence`."""
+        """Return the log evidence of the observations with its k-hat; arguments as in `Posterior.evidence`."""
         with evaluating(self.model):
             return self.posterior.evidence(self.program, self.seen, particles, seed=seed, chunk=chunk)
 
@@ -269,11 +296,11 @@ class Completed:
 
     @property
     def shape(self) -> Tensor:
-        """The most probable bodies (B, S), or the known ones."""
+        """The most probable shape parameters (B, S), or the observed ones."""
         return self._decode(self.posterior.mode)[1]
 
     def draw(self, n: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-        """Draw frames (n, B, N, D) and bodies (n, B, S) from the posterior."""
+        """Draw n frames (n, B, N, D) and shape parameters (n, B, S) from the posterior."""
         return self._decode(self.posterior.draw(n, seed))
 
     @torch.no_grad()
@@ -303,6 +330,9 @@ def complete(
         seen: observations, in the format of this module.
         deviations, markers, known, aggregate: same as in `SegmentCompletion`.
         descent, seed, chunk, progress: same as in `dvae.posterior`.
+
+    Returns:
+        The most probable segments (`x`, `shape`) and their posterior.
 
     Raises:
         ValueError: same as `SegmentCompletion.read`.
@@ -334,15 +364,19 @@ def simulate_observations(
 
     Args:
         model: model of segments, as in `SegmentCompletion`.
-        x, shape: frames (B, N, D) on bodies (B, S).
-        kind: "surfaces", "points" or "markers".
-        fps: observed moments per second, at known times.
-        seconds: observed duration from the start; default: all.
-        frames: observed frames of chi, at unknown times; replaces `fps` and `seconds`.
-        points: number of points M, drawn uniformly from the surface.
+        x, shape: frames (B, N, D), and shape parameters (B, S) of their bodies.
+        kind: kind of observations: "surfaces", "points" or "markers".
+        fps: number of observed moments per second; their times are part of the observations.
+        seconds: duration in seconds that is observed from the start; default: the whole segment.
+        frames: indices of the observed frames of chi. If given, times are not observed, and `fps` and `seconds` are
+            ignored.
+        points: number of points M per moment, drawn uniformly from the surface.
         gaps: fraction of points or markers that are missing.
-        markers: vertices of the markers.
+        markers: (L,), vertex index of each marker.
         seed: seed of points and gaps.
+
+    Returns:
+        Observations in the format of this module, NaN where missing or after the end of a segment.
 
     Raises:
         ValueError: the kind is unknown.
@@ -369,7 +403,14 @@ def simulate_observations(
 
 
 def sample_surfaces(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:
-    """Draw points (..., M, 3) uniformly from surfaces (..., V, 3)."""
+    """Draw points (..., M, 3) uniformly from surfaces.
+
+    Args:
+        vertices: (..., V, 3).
+        faces: (F, 3), vertex indices of triangles.
+        points: number of points M per surface.
+        generator: source of random numbers.
+    """
     first, second, third = (vertices[..., corner, :] for corner in faces.unbind(-1))
     area = (second - first).cross(third - first, dim=-1).norm(dim=-1)
     triangles = torch.multinomial(area.flatten(0, -2), points, replacement=True, generator=generator)
@@ -391,7 +432,13 @@ def chamfer(points: Tensor, vertices: Tensor) -> Tensor:
 
 
 def surfaces_at(model: Any, x: Tensor, shape: Tensor, times: Tensor) -> Tensor:
-    """Return surfaces (B, K, V, 3) of frames (B, N, D) on bodies (B, S) at times (B, K); NaN after the end."""
+    """Return surfaces (B, K, V, 3) in metres at given times; NaN after the end of a segment.
+
+    Args:
+        model: model of segments, as in `SegmentCompletion`.
+        x, shape: frames (B, N, D), and shape parameters (B, S) of their bodies.
+        times: (B, K) in seconds from the first frame.
+    """
     frames, reached = _at_moments(model.timed, x, {TIMES: times})
     surfaces: Tensor = model.body(shape, *model.timed.poses(frames))[0]
     return torch.where((times <= reached + 1e-4)[..., None, None], surfaces, torch.nan)
@@ -405,9 +452,9 @@ def error_by_time(
     A prediction that ends earlier keeps its last pose.
 
     Args:
-        model: model of segments.
-        made, truth: frames (B, N, D) and bodies (B, S) of each.
-        times: K times in seconds.
+        model: model of segments, as in `SegmentCompletion`.
+        made, truth: predicted and true segments, each as frames (B, N, D) and shape parameters (B, S).
+        times: K times in seconds from the first frame.
 
     Returns:
         mean vertex error (K,) in metres, NaN if no segment is long enough, and the number of segments (K,).
@@ -421,7 +468,10 @@ def error_by_time(
 
 
 def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tensor, points: Tensor) -> Tensor:
-    """Return indices (B, K, M) of the vertices nearest to points (B, K, M, 3); other arguments as in `Body`."""
+    """Return indices (B, K, M) of the vertices nearest to points (B, K, M, 3).
+
+    The pose is given by `shape`, `rotations` and `places` (translation), as in `Body.forward`.
+    """
     indices = []
     with torch.no_grad():
         at_once = max(1, AT_ONCE // points.shape[1])
@@ -439,8 +489,8 @@ def _shrink(means: Tensor, variance: Tensor) -> Tensor:
     """Return the covariance (Z, Z) of a mixture of N normals with these means (N, Z) and mean variances (Z,).
 
     It is shrunk towards a multiple of the identity by oracle approximating shrinkage (Chen, Wiesel, Eldar and Hero
-    2010, IEEE Transactions on Signal Processing 58:10), so that a few segments do not exclude everything else. The
-    estimator assumes independent means, so many segments of one take are shrunk too little.
+    2010, IEEE Transactions on Signal Processing 58:10), so that a prior from few segments does not exclude different
+    segments. The estimator assumes independent means. If many segments are from the same take, it shrinks too little.
     """
     (n, p), centred = means.shape, means - means.mean(0)
     covariance = (centred.mT @ centred) / n + variance.diag()
@@ -455,7 +505,16 @@ def _standard(dimensions: int, kind: Tensor) -> Any:
 
 
 def _observe(name: str, decoded: Tensor, seen: Tensor, deviation: float) -> None:
-    """Add the log density of observations as a factor, which avoids a scale per value and its logarithm."""
+    """Add the normal log density of observations as one `pyro.factor` per segment.
+
+    This is faster than `pyro.sample` with `obs`, which would compute a logarithm for each value.
+
+    Args:
+        name: name of the factor.
+        decoded: expected observations, same shape as `seen`.
+        seen: observations (B, ...), NaN where missing.
+        deviation: standard deviation of all values.
+    """
     observed = seen.isfinite()
     squared_error = torch.where(observed, seen.nan_to_num(0.0) - decoded, 0.0).flatten(1).square().sum(-1)
     pyro.factor(name, -squared_error / (2 * deviation**2) - observed.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
@@ -472,7 +531,13 @@ def _at_moments(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple
 def _interpolate(
     decoded: Tensor, decode: Callable[[Tensor | None], Tensor], seen: Mapping[str, Any]
 ) -> tuple[Tensor, Tensor]:
-    """Return `_at_moments` for frames at times `decoded` (B, N); `decode` takes frame indices, or None for all."""
+    """Return the frames (B, K, D) at the observed moments and their times (B, K), and decode only needed frames.
+
+    Args:
+        decoded: times (B, N) of all frames in seconds.
+        decode: function from frame indices, or None for all frames, to these frames (B, n, D).
+        seen: observations with times or frames.
+    """
     n_frames = decoded.shape[1]
     times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)
     moments = times.nan_to_num(0.0)

@@ -26,7 +26,7 @@ Segmentation = Literal["gait", "clips"]
 """How motion is cut into segments: gait cycles, or whole clips whose duration is plausible for a cycle."""
 
 VALIDATION = 0.1
-"""Fraction of the training takes held out for validation."""
+"""Fraction of the training takes that are used for validation instead."""
 
 
 def subsample_clips(clips: Sequence[Clip], many: int) -> list[Clip]:
@@ -36,14 +36,14 @@ def subsample_clips(clips: Sequence[Clip], many: int) -> list[Clip]:
 
 @dataclass(frozen=True)
 class SegmentSource:
-    """Record of where segments were read.
+    """Record of the file and the options from which segments were read.
 
     Args:
-        path: file as it was given, or "simulated".
+        path: path of the file as the user gave it, or "simulated".
         fingerprint: SHA-256 of the clips and of `cut`.
-        cut: how clips were cut into segments.
+        cut: how clips were cut into segments, "gait" or "clips".
         skip_bad: whether unusable clips were left out.
-        bodies: deviation of the training bodies, as in `Segments`.
+        bodies: standard deviation of the shape parameters drawn for training segments, as in `Segments`.
     """
 
     path: str
@@ -64,14 +64,15 @@ class SegmentData:
     takes. Motion is fitted to the body only when it is needed.
 
     Args:
-        path: file as it was given, or "simulated".
+        path: path of the file as the user gave it, or "simulated".
         motion: clips as they were read.
-        cut: how clips are cut into segments.
+        cut: how clips are cut into segments: "gait" finds gait cycles, "clips" uses whole clips.
         skip_bad: whether unusable clips were left out.
         scaling: scaling of rotations, as in `TimedFrames.of`.
-        warped: align the frames with the most typical gait cycles of these data, as in `TimedFrames`.
-        bodies: deviation of the shapes drawn for training segments, as in `Segments`; 0 keeps their own shapes.
-        seen: representation of a run; default: estimated from the training segments.
+        warped: whether frames are aligned with the most typical gait cycles of these data, as in `TimedFrames`.
+        bodies: standard deviation of the shape parameters drawn for training segments, as in `Segments`; 0 keeps their
+            own shapes.
+        seen: conversion to frames of an existing run; default: estimated from the training segments.
     """
 
     kind: ClassVar[str] = "segments"
@@ -141,15 +142,15 @@ class SegmentData:
         clips = [clip for clip in self.motion if cycles.shortest <= (clip.frames - 1) / fps <= cycles.longest]
         if not clips:
             raise ValueError(
-                f"{self.path} has no clip of {cycles.shortest:g} to {cycles.longest:g} s that can be a whole "
-                "segment; cut='gait' finds the gait cycles of longer ones"
+                f"cut='clips' uses clips of {cycles.shortest:g} to {cycles.longest:g} s as segments, but {self.path} "
+                "has none; cut='gait' finds the gait cycles in longer clips"
             )
         marked = [replace(clip, labels={**clip.labels, "source": clip.name}) for clip in clips]
         return fit_to_body(replace(self.motion, clips=marked), human())
 
     @cached_property
     def timed(self) -> TimedFrames:
-        """Representation of the segments as frames."""
+        """Conversion of the segments to frames: `seen`, or estimated from the training segments."""
         return self.seen or self._training.timed
 
     def windows(self, split: str) -> Segments:
@@ -180,9 +181,11 @@ class SegmentData:
         if len(clips) != 1:
             names = [key.partition("/")[2] for key in (*takes, *segments)]
             raise ValueError(
-                f"no segment or take {name!r}{nearest(name, names)} in {self.path}; the first is {next(iter(segments))}"
+                f"no segment or take {name!r}{nearest(name, names)} in {self.path}; the first segment is "
+                f"{next(iter(segments))}"
                 if not clips
-                else f"{name!r} is the name of several; choose {' or '.join('/'.join(clip.key) for clip in clips)}"
+                else f"several segments or takes are named {name!r}; choose "
+                f"{' or '.join('/'.join(clip.key) for clip in clips)}"
             )
         return Segments(replace(self.segments, clips=clips), self.timed)
 
@@ -192,14 +195,14 @@ class SegmentData:
 
     @classmethod
     def reopened(cls, source: SegmentSource, schema: SegmentSchema, path: str | os.PathLike[str] | None = None) -> Self:
-        """Open recorded data again, from the recorded path or from another one, in the representation of a run.
+        """Open the data of a run again, with the run's conversion to frames.
 
-        The content may have changed.
+        The fingerprint is not compared, so the content of the file may have changed.
 
         Args:
             source: result of `recorded`.
             schema: schema of the run.
-            path: current path, or path of other data.
+            path: path of the data now, or of other data; default: the recorded path.
 
         Raises:
             FileNotFoundError, ValueError: same as `open`.
@@ -209,7 +212,7 @@ class SegmentData:
 
     @cached_property
     def _training(self) -> Segments:
-        """The training segments, which define the units of frames unless a run defines them."""
+        """The training segments; unless `seen` was given, the units of frames are estimated from them."""
         motion = self._of("train")
         if self.seen is not None:
             return Segments(motion, self.seen, bodies=self.bodies)

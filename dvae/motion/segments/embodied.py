@@ -34,10 +34,10 @@ SHAPE = "beta"
 
 @dataclass(frozen=True)
 class SegmentSchema(Schema):
-    """The schema of segments on the bundled body: x (B, N, D) and beta (B, S).
+    """The schema of segments on the bundled body: frames x (B, N, D) and shape parameters beta (B, S).
 
     Args:
-        timed: conversion between segments and frames.
+        timed: conversion between segments of motion and frames.
     """
 
     kind: ClassVar[str] = "segments"
@@ -59,7 +59,7 @@ class SegmentSchema(Schema):
     @property
     @override
     def windows(self) -> Schema:
-        """Schema of the results, which are surfaces of the same bodies whatever the representation of frames."""
+        """Schema without the representation of frames; runs for which it is equal can be evaluated on the same data."""
         return Schema({SHAPE: self.size(SHAPE)})
 
     @override
@@ -76,16 +76,16 @@ class SegmentSchema(Schema):
         skeleton = Skeleton(**tuples(timed.pop("skeleton")))
         if (skeleton.names, skeleton.parents, skeleton.up) != (body.names, body.parents, "y"):
             raise ValueError(
-                f"timed.skeleton must be the skeleton of the supplied body, {', '.join(body.names)} with y up"
+                f"timed.skeleton must be the skeleton of the bundled body, {', '.join(body.names)} with y up"
             )
         schema = cls.from_data(TimedFrames(skeleton, references=references, **tuples(timed)), body)
         if config["sizes"] != schema.sizes:
-            raise ValueError(f"sizes are {brief(config['sizes'])}, expected {schema.sizes} for such segments")
+            raise ValueError(f"sizes are {brief(config['sizes'])}, expected {schema.sizes} for the frames in `timed`")
         return schema
 
 
 def _reference(config: Mapping[str, Any]) -> Reference:
-    """Return the reference of a config."""
+    """Return the reference cycle that is stored in a config."""
     hips = np.array(config["hips"], dtype=np.float64)
     if hips.ndim != 3 or hips.shape[1:] != (2, 4) or len(hips) < 2 or not np.isfinite(hips).all():
         raise ValueError(f"hips of a reference are {hips.shape}, expected finite quaternions (at least 2, 2, 4)")
@@ -93,13 +93,14 @@ def _reference(config: Mapping[str, Any]) -> Reference:
 
 
 class Segments:
-    """Segments in the representation of a model: training data that draw batches, or test data.
+    """Segments as inputs of a model: training data, from which batches are drawn, or test data.
 
     Args:
         motion: segments on the joints of the body, each a clip, e.g. from `bodies.fit_to_body` and `gait_cycles`.
-        timed: conversion to frames; for test data, the one of the training data.
+        timed: conversion to frames; for test data, the conversion of the training data. Default: estimated from
+            `motion`.
         body: body with these joints; default: the bundled person.
-        seen: result of `timed` for these segments, if known.
+        seen: result of `timed.to(motion)`, if it was computed already.
         bodies: standard deviation of the shape parameters that `sample` draws in place of the segments' own; 0 keeps
             their own. Root positions scale with the length of the legs, as in `bodies.retarget`. A model trained on
             few bodies does not generalise to others.
@@ -131,7 +132,15 @@ class Segments:
         return self._batch
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Mapping[str, Any]:
-        """Return `batch_size` distinct segments in random order, or all if there are fewer."""
+        """Return `batch_size` distinct random segments, or all in random order if there are fewer.
+
+        Args:
+            batch_size: number of segments B.
+            generator: source of random numbers.
+
+        Returns:
+            x (B, N, D) and beta (B, S), on random bodies unless `bodies` is 0.
+        """
         rows = torch.randperm(len(self), generator=generator)[:batch_size]
         batch = Batch(self._batch).rows(rows)
         if not self.bodies:
@@ -140,7 +149,14 @@ class Segments:
         return self.on_bodies(batch, shapes.clamp(-MOST, MOST))
 
     def on_bodies(self, batch: Mapping[str, Any], shape: Tensor) -> Mapping[str, Any]:
-        """Return the same rotations and times on bodies (B, S); root positions scale with the length of the legs."""
+        """Return a batch with the same rotations and times on other bodies.
+
+        Root positions scale with the length of the legs.
+
+        Args:
+            batch: x (B, N, D) and beta (B, S).
+            shape: (B, S), shape parameters of the other bodies.
+        """
         legs = [standing_heights(self.body, shapes).to(shape) for shapes in (batch[SHAPE], shape)]
         x = batch[WHOLE].clone()
         x[..., self.timed.parts["translation"]] *= (legs[1] / legs[0])[:, None, None]
@@ -158,12 +174,18 @@ class Segments:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the model's input."""
+        """SHA-256 of x and beta of all segments."""
         content = b"".join(self._batch[name].numpy().tobytes() for name in (WHOLE, SHAPE))
         return hashlib.sha256(content).hexdigest()
 
     def back(self, x: Tensor, shape: Tensor | None = None, fps: float | None = None) -> MotionSet:
-        """Convert frames (B, N, D) to motion from the start of these segments, on bodies (B, S) or their own."""
+        """Convert frames to motion that starts at the position and heading of these segments.
+
+        Args:
+            x: frames (B, N, D), one for each segment.
+            shape: (B, S), shape parameters; default: those of the segments.
+            fps: frames per second; default: the rate of the skeleton.
+        """
         offsets = self.body.offsets(self._batch[SHAPE] if shape is None else shape)
         return self.timed.back({**self._start, OFFSETS: offsets, WHOLE: x}, fps)
 

@@ -43,7 +43,7 @@ ORIGIN = "origin"
 """Name in batches of the root positions in first frames, (B, 3) in metres."""
 
 ROUNDS = 4
-"""Iterations that correct the loss of interpolation to N frames and back; each halves the loss at least.
+"""Number of iterations that correct the loss of interpolation to N frames and back; each at least halves the loss.
 
 For segments of 91 frames of bandai2 and cmu8 at 30 frames a second, the largest errors fall from 4 and 13 mm to .2
 and .7 mm."""
@@ -66,8 +66,10 @@ class TimedFrames:
         skeleton: skeleton of the segments, with a rest pose, left and right.
         frames: number of frames N.
         metres: unit of positions in metres.
-        seconds: duration of the segment whose even increments are 1.
-        mean, deviation: of the six numbers of each joint with children; default: the identity rotation, and 1.
+        seconds: unit of durations in seconds: if N frames are spaced evenly over this duration, their time increments
+            are 1.
+        mean, deviation: means and standard deviations (6 K,) that standardise the six numbers of each of the K joints
+            with children; default: the identity rotation, and 1.
         references: reference cycles for time warping. Frame n of chi is the point in the segment that is aligned with
             frame n of the nearest reference, resampled to N frames (`gait.stamps`). Default: N frames evenly in time.
 
@@ -101,9 +103,9 @@ class TimedFrames:
                     f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints with children"
                 )
         if not np.isfinite([*self.mean, *self.deviation]).all():
-            raise ValueError("mean or deviation have NaN or infinite numbers")
+            raise ValueError("`mean` and `deviation` must be finite, got NaN or infinite numbers")
         if any(value <= 0 for value in self.deviation):
-            raise ValueError(f"deviations must be above 0, got {min(self.deviation)}")
+            raise ValueError(f"all values of `deviation` must be above 0, got {min(self.deviation)}")
 
     @classmethod
     def of(
@@ -120,7 +122,7 @@ class TimedFrames:
             frames: number of frames N.
             scaling: scaling of rotations: "identity" subtracts the identity rotation, "deviation" standardises by mean
                 and standard deviation, which the paper found unstable.
-            references: reference cycles for time warping, as in the class.
+            references: reference cycles for time warping, as in `TimedFrames`.
 
         Raises:
             ValueError: the scaling is unknown, or `to` raises it.
@@ -135,7 +137,10 @@ class TimedFrames:
         scaling: Literal["identity", "deviation"] = "identity",
         references: Sequence[Reference] = (),
     ) -> tuple[Self, dict[str, Any]]:
-        """Return the results of `of` and of `to` for these segments; their frames are computed only once."""
+        """Return the conversion from `of` and the result of its `to` for the same segments, computed together.
+
+        This is faster than two calls. Arguments and errors are the same as in `of`.
+        """
         if scaling not in ("identity", "deviation"):
             raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
         view = cls(motion.skeleton, frames, references=references)
@@ -152,7 +157,7 @@ class TimedFrames:
 
     @property
     def turning(self) -> list[int]:
-        """The K joints with children."""
+        """Indices of the K joints with children, whose rotations a frame contains."""
         return sorted({parent for parent, _ in self.skeleton.edges})
 
     @property
@@ -173,8 +178,8 @@ class TimedFrames:
             motion: clips with rotations, at any frame rate.
 
         Returns:
-            A batch of x (B, N, D) and the information that `back` needs: the heading (B,) in radians and the origin
-            (B, 3) in metres of first frames, and the body as offsets (B, J, 3) of its rest pose.
+            A batch of x (B, N, D) and the information that `back` needs: "heading" (B,) in radians and "origin" (B, 3)
+            in metres of the first frames, and "offsets" (B, J, 3) in metres of joints from their parents at rest.
 
         Raises:
             ValueError: a clip has no rotations, only one frame, or another skeleton.
@@ -185,8 +190,8 @@ class TimedFrames:
         """Convert time-stamped frames, from `to` or from a decoder, to motion.
 
         Args:
-            seen: x (B, N, D), and optional entries. Defaults: heading zero, origin 0, and the body of the skeleton's
-                rest pose as offsets.
+            seen: x (B, N, D); optionally "heading", "origin" and "offsets" as returned by `to`. Defaults: heading zero,
+                origin 0, and the offsets of the skeleton's rest pose.
             fps: frames per second; default: the rate of the skeleton.
 
         Returns:
@@ -197,7 +202,7 @@ class TimedFrames:
         """
         skeleton, x = replace(self.skeleton, fps=fps or self.skeleton.fps), seen[WHOLE].detach().cpu().double()
         if not x.isfinite().all():
-            raise ValueError(f"{int((~x.isfinite()).sum())} of the numbers of frames are NaN or infinite")
+            raise ValueError(f"x has {int((~x.isfinite()).sum())} NaN or infinite values; all must be finite")
         rotations, places, times = self.unpack(x)
         clips = []
         for b in range(len(x)):
@@ -224,8 +229,9 @@ class TimedFrames:
         """Return rotations, root positions and times of frames (..., N, D), with gradients.
 
         Returns:
-            local rotations of all joints (..., N, J, 3, 3), the identity without children; root positions relative to
-            the first frame (..., N, 3) in metres; and times since the first frame (..., N) in seconds.
+            local rotations of all joints (..., N, J, 3, 3), which are the identity for joints without children; root
+            positions relative to the first frame (..., N, 3) in metres; and times since the first frame (..., N) in
+            seconds.
 
         Raises:
             ValueError: x has another shape.
@@ -253,11 +259,11 @@ class TimedFrames:
         return pad(later.cumsum(-1), (1, 0))
 
     def lasts(self, x: Tensor) -> Tensor:
-        """Return the durations of segments (..., N, D), (...,) in seconds: the sum of their increments."""
+        """Return the durations (...,) in seconds of segments (..., N, D), which are the sums of time increments."""
         return self.times(x)[..., -1]
 
     def travels(self, x: Tensor) -> Tensor:
-        """Return the distance of the root between first and last frame of (..., N, D), (...,) in metres."""
+        """Return the distances (...,) in metres between first and last root position of segments (..., N, D)."""
         first, last = self.poses(x[..., [0, -1], :])[1].unbind(-2)
         distance: Tensor = (last - first).norm(dim=-1)
         return distance
@@ -297,7 +303,7 @@ class TimedFrames:
     ) -> Tensor:
         """Return unscaled x (B, N, D) of quaternions (B, F, J, 4) and positions (B, F, 3), rotated by angles (B, 1).
 
-        Its frames are at `frames` (B, N) of the clips, or (1, N) for all clips.
+        `frames` are the frame numbers of the clips at which x is evaluated, (B, N), or (1, N) for all clips.
         """
         root, times = self.skeleton.root, np.arange(quaternions.shape[1])
         first, root_positions = self._rotate_root(
@@ -316,7 +322,7 @@ class TimedFrames:
         return torch.cat([rotations, root_positions, increments[..., None]], -1)
 
     def _scaled(self, unscaled: Mapping[str, Any]) -> dict[str, Any]:
-        """Return scaled values in single precision."""
+        """Return the result of `_unscaled` with x in the units of this conversion, in single precision."""
         mean, deviation = self._scaling(unscaled[WHOLE])
         others = mean.new_tensor([self.metres] * 3 + [self.seconds / (self.frames - 1)])
         x = (unscaled[WHOLE] - pad(mean, (0, 4))).div_(torch.cat([deviation, others]))
@@ -328,7 +334,7 @@ class TimedFrames:
         return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(positions, angle, up)
 
     def _six_numbers(self, x: Tensor) -> Tensor:
-        """Return six numbers of each joint with children (..., K, 6)."""
+        """Return the six numbers (..., K, 6) of each joint with children from frames (..., D), without scaling."""
         mean, deviation = self._scaling(x)
         numbers: Tensor = (x[..., :-4] * deviation + mean).unflatten(-1, (-1, 6))
         return numbers
@@ -364,7 +370,7 @@ def _of_one_length(motion: MotionSet) -> Iterator[tuple[np.ndarray, Tensor, Tens
 
 
 def _join(quaternions: Tensor, root: Tensor) -> Tensor:
-    """Concatenate (..., K, 4) and (..., 3) to (..., 4 K + 3)."""
+    """Concatenate quaternions (..., K, 4) and root positions (..., 3) to joined values (..., 4 K + 3)."""
     return torch.cat([quaternions.flatten(-2), root], -1)
 
 
@@ -381,7 +387,7 @@ def _normalise(values: Tensor) -> Tensor:
 
 
 def _cubic(times: np.ndarray, targets: np.ndarray) -> Tensor:
-    """Return the matrix (N, F) that interpolates values at F times to N others by the not-a-knot cubic spline."""
+    """Return the matrix (N, F) that interpolates values at F times to N target times by a not-a-knot cubic spline."""
     degree = min(3, len(times) - 1)
     knots = np.concatenate([times[:1].repeat(degree + 1), times[2:-2], times[-1:].repeat(degree + 1)])
     splines = scipy.interpolate.BSpline

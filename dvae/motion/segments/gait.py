@@ -11,8 +11,8 @@ overlapping subsequences. Our choices:
   between the times where a thigh is furthest forward (just before the foot is put down). The reference is the cycle
   with the smallest mean distance from the others. Labels are not used.
 * **The rotation of a hip is the rotation of the thigh relative to the pelvis.** The distance of two poses is the root
-  mean square angle between the rotations of both hips. The cost of a subsequence is the mean distance along the path,
-  in radians.
+  mean square angle between the rotations of both hips. The cost of a subsequence is the mean distance along its warping
+  path to the reference, in radians.
 * **Of overlapping subsequences, the cheapest is kept**, separately for each reference: a walk is cut into consecutive
   cycles of the left foot, and into cycles of the right foot half a cycle later.
 """
@@ -45,13 +45,16 @@ class Cycles:
     """Definition of a gait cycle.
 
     Args:
-        threshold: maximum cost of the hips in radians: the mean angle along the path to a reference. It also bounds the
-            distance between first and last pose, since half a cycle ends with the other foot in front.
+        threshold: maximum mean angle in radians between the hips of a cycle and those of the reference, after their
+            time warping. It also bounds the distance between first and last pose. This excludes half cycles, which
+            end with the other foot in front.
         shortest, longest: minimum and maximum duration in seconds.
         overlap: maximum overlap of two cycles with the same starting foot, as a fraction of the shorter one.
         rate: frames per second of the comparison.
-        swing: minimum standard deviation of the angle between the thighs, in radians; motion with less is not a step.
-        regular: minimum regularity of a clip that provides references, at most 2.
+        swing: minimum standard deviation of the angle between the thighs in radians; motion below it is no gait.
+        regular: minimum regularity of a clip from which references are taken, from 0 to 2; 2 is a periodic motion. The
+            regularity is the autocorrelation of the angle between the thighs at a lag of one cycle, minus that at half
+            a cycle.
     """
 
     threshold: Amount = 0.25
@@ -65,7 +68,7 @@ class Cycles:
     def __post_init__(self) -> None:
         check(self)
         if self.shortest > self.longest:
-            raise ValueError(f"cycles last from {self.shortest} to {self.longest} seconds; expected the shorter first")
+            raise ValueError(f"`shortest` must be at most `longest` ({self.longest} seconds), got {self.shortest}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +77,9 @@ class Reference:
 
     Args:
         side: side of the starting foot.
-        hips: (M, 2, 4), rotations of the left and the right hip relative to the pelvis, as quaternions.
+        hips: (M, 2, 4), rotations of the left and the right thigh relative to the pelvis, as quaternions.
         rate: frames per second.
-        source: split and name of the clip it was taken from.
+        source: split and name of the clip that contains the cycle.
     """
 
     side: Literal["left", "right"]
@@ -110,8 +113,9 @@ def gait_cycles(
         cycles: definition of a cycle.
 
     Returns:
-        Clips in the splits of their sources, with the labels of their sources and `cycle` (left or right, the starting
-        foot), `source` (name of the clip), `start` (its frame) and `cost` (radians).
+        Clips in the splits of their source clips. They have the labels of their source clips, and the labels `cycle`
+        (starting foot, left or right), `source` (name of the source clip), `start` (first frame in it) and `cost` (in
+        radians).
 
     Raises:
         ValueError: no cycles were found, or `reference_cycles` raises it.
@@ -127,7 +131,7 @@ def gait_cycles(
     if not clips:
         raise ValueError(
             f"{motion.name or 'this motion'} has no gait cycle of {cycles.shortest:g} to {cycles.longest:g} s whose "
-            f"hips are within {cycles.threshold:g} rad of the references; raise the threshold, if people walk in it"
+            f"hips are within {cycles.threshold:g} rad of the references; if people walk in it, raise `threshold`"
         )
     return MotionSet(
         clips, motion.skeleton, f"{motion.name} cycles".strip(), copy=False, interpretation=motion.interpretation
@@ -137,9 +141,14 @@ def gait_cycles(
 def on_common_joints(first: MotionSet, second: MotionSet) -> tuple[MotionSet, MotionSet]:
     """Return the motion of two sources on their common joints, to train on one and test on the other.
 
-    Both get the same tree: the tree of the first without the joints that the second does not have. `MotionSet.loosened`
-    adds joints where bones move relative to each other in either source. Each source has rotations, estimated for its
-    own rest pose.
+    Both results have the same joint tree: the tree of the first source without the joints that the second does not
+    have. `MotionSet.loosened` adds joints where bones move relative to each other in either source.
+
+    Args:
+        first, second: motion with some joint names in common.
+
+    Returns:
+        The motion of both sources, each with rotations that are estimated for its own rest pose.
 
     Raises:
         ValueError: the common joints do not form a tree.
@@ -168,6 +177,12 @@ def on_common_joints(first: MotionSet, second: MotionSet) -> tuple[MotionSet, Mo
 def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference], cycles: Cycles) -> list[FoundCycle]:
     """Return the gait cycles of a clip, ordered by their first frames.
 
+    Args:
+        clip: clip with rotations.
+        skeleton: skeleton of the clip.
+        references: reference cycles, e.g. from `reference_cycles`.
+        cycles: definition of a cycle.
+
     Raises:
         ValueError: the clip has no rotations, or the rate of a reference differs from `cycles.rate`.
     """
@@ -183,7 +198,8 @@ def find_cycles(clip: Clip, skeleton: Skeleton, references: Iterable[Reference],
     for reference in references:
         if reference.rate != cycles.rate:
             raise ValueError(
-                f"a reference has {reference.rate:g} frames a second, expected {cycles.rate:g} as in cycles"
+                f"a reference has {reference.rate:g} frames a second, but `cycles` compares at {cycles.rate:g}; "
+                "compute references with reference_cycles(motion, cycles)"
             )
         if not possible.any():
             continue  # true for most clips; skips the expensive costs
@@ -233,9 +249,16 @@ def reference_cycles(motion: MotionSet, cycles: Cycles | None = None) -> tuple[R
 
 
 def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], frames: int) -> np.ndarray:
-    """Align a clip with evenly spaced frames of the nearest reference: (frames,) increasing frames of the clip.
+    """Return the increasing frame numbers (frames,) of a clip that are aligned with even frames of a reference.
 
-    The pace is from half to twice the pace of the reference, after it is resampled to the length of the clip.
+    Clip and references are resampled to `frames` evenly spaced frames. The pace on the path is then from half to twice
+    the pace of the reference.
+
+    Args:
+        clip: clip with rotations.
+        skeleton: skeleton of the clip.
+        references: reference cycles; the one with the smallest cost is used.
+        frames: number of frames of the result.
     """
 
     def even(hips: np.ndarray) -> np.ndarray:
@@ -254,7 +277,7 @@ def stamps(clip: Clip, skeleton: Skeleton, references: Sequence[Reference], fram
 
 
 def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
-    """Return a clip at another frame rate, and the number of original frames per new frame."""
+    """Return a clip of `fps` frames per second at another rate, and the number of original frames per new frame."""
     if clip.rotations is None:
         raise ValueError(
             f"clip {'/'.join(clip.key)} has no rotations of joints; MotionSet.with_rotations() computes them"
@@ -270,9 +293,9 @@ def _resting(skeleton: Skeleton) -> torch.Tensor:
 
 @lru_cache(maxsize=8)
 def _legs(skeleton: Skeleton) -> list[list[int]]:
-    """Return for each side the joints from below the root down to the hip, and then the knee.
+    """Return the indices of joints of the left and the right leg, from the child of the root to the hip and the knee.
 
-    The hip is the lowest joint at rest where left and right leave the trunk.
+    Arm and leg of a side both begin at the trunk; the hip is the lowest of these first joints in the rest pose.
     """
     rest, legs = _resting(skeleton), []
     for leaving in skeleton.sides:
@@ -301,7 +324,7 @@ def _thigh_rotations(clip: Clip, skeleton: Skeleton) -> torch.Tensor:
 
 
 def _hip_quaternions(thighs: torch.Tensor) -> np.ndarray:
-    """Return the same rotations as quaternions (F, 2, 4)."""
+    """Convert rotations of the thighs (F, 2, 3, 3) to quaternions (F, 2, 4)."""
     quaternions: np.ndarray = from_matrix(thighs, "quaternion").numpy()
     return quaternions
 
@@ -318,16 +341,20 @@ def _thigh_angles(rotations: torch.Tensor, skeleton: Skeleton) -> np.ndarray:
 
 
 def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return (M, F) root mean square angles over both hips between quaternions (M, 2, 4) and (F, 2, 4), in radians."""
+    """Return the distances (M, F) in radians between all pairs of hip rotations (M, 2, 4) and (F, 2, 4).
+
+    A distance is the root mean square over both hips of the angle between the rotations.
+    """
     cosine = np.abs(np.einsum("mhq,fhq->hmf", first, second)).clip(max=1)
     distances: np.ndarray = np.sqrt(np.square(2 * np.arccos(cosine)).mean(0))
     return distances
 
 
 def _regularity(swing: np.ndarray, cycles: Cycles) -> tuple[float, int]:
-    """Return the maximum regularity of an angle (F,), and its period.
+    """Return the regularity of an angle (F,) at its best period, and this period in frames.
 
-    A regular angle repeats after a period, and changes its sign after half of it."""
+    A regular angle repeats after a period, and changes its sign after half a period. The regularity is the
+    autocorrelation at the period minus the autocorrelation at half the period."""
     swing = swing - swing.mean()
     shortest = max(2, round(cycles.shortest * cycles.rate))
     lags = np.arange(shortest, min(int(cycles.longest * cycles.rate), (len(swing) - 1) // 2) + 1)
@@ -360,7 +387,7 @@ def _most_typical(cycles: Sequence[tuple[np.ndarray, Clip]]) -> tuple[np.ndarray
 
 
 def _deviations(angle: np.ndarray, longest: int) -> np.ndarray:
-    """Return (F, K) standard deviations of an angle (F,) over k + 1 frames from s on; 0 if the clip ends earlier."""
+    """Return standard deviations (F, K) of an angle (F,): at [s, k], of k + 1 frames from frame s; 0 after the end."""
     frames = np.arange(len(angle))[:, None] + np.arange(longest + 1)
     sums, squares = (np.pad(np.cumsum(values), (1, longest), mode="edge") for values in (angle, angle**2))
     counts = np.arange(1, longest + 1)
@@ -370,7 +397,7 @@ def _deviations(angle: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _end_distances(hips: np.ndarray, longest: int) -> np.ndarray:
-    """Return (F, K) distances between the first and last of k + 1 poses from frame s on; arbitrary after the end."""
+    """Return distances (F, K) in radians: at [s, k], between frames s and s + k; arbitrary after the end."""
     padded = np.concatenate([hips, np.repeat(hips[-1:], longest - 1, axis=0)])
     later = np.lib.stride_tricks.sliding_window_view(padded, longest, axis=0)  # (F, 2, 4, K)
     cosine = np.abs(np.einsum("fhq,fhqk->hfk", hips, later)).clip(max=1)
@@ -379,7 +406,13 @@ def _end_distances(hips: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _select_cheapest(costs: np.ndarray, threshold: float, overlap: float) -> list[tuple[int, int]]:
-    """Return starts and lengths of subsequences [s, k] below a threshold, the cheapest first, with limited overlap."""
+    """Select subsequences with limited overlap, the cheapest first, and return their first frames s and their k.
+
+    Args:
+        costs: (F, K), at [s, k] the cost of the subsequence of k + 1 frames from frame s.
+        threshold: maximum cost.
+        overlap: maximum overlap of two subsequences, as a fraction of the shorter one.
+    """
     starts, lengths = np.nonzero(costs <= threshold)
     order = np.argsort(costs[starts, lengths], kind="stable")
     starts, lengths = starts[order], lengths[order]

@@ -38,10 +38,10 @@ class Interpolation:
     Attributes:
         timed: conversion of frames to motion.
         body: moving body.
-        shares: (M,), interpolation weights from 0 to 1.
-        latent: (B, M, Z).
-        shape: beta, (B, M, S).
-        x: frames (B, M, N, D).
+        shares: (M,), weight of the second end in each step, from 0 to 1.
+        latent: interpolated z, (B, M, Z).
+        shape: interpolated beta, (B, M, S).
+        x: decoded frames, (B, M, N, D).
     """
 
     timed: TimedFrames
@@ -68,7 +68,10 @@ class Interpolation:
 
     @property
     def local_pose(self) -> Tensor:
-        """The same for all other joints with children, relative to their parents, averaged over these joints too."""
+        """Mean angle (B, M) in degrees of joint rotations relative to the first step.
+
+        The mean is over frames and over all joints with children except the root. Rotations are relative to the parent.
+        """
         others = [joint for joint in self.timed.turning if joint != self.timed.skeleton.root]
         return self._mean_angle(self._unpacked[0][..., others, :, :])
 
@@ -83,7 +86,11 @@ class Interpolation:
         }
 
     def table(self, pair: int = 0) -> Table:
-        """Return the measures of a pair, step by step."""
+        """Return a table of the four measures, with one row per step.
+
+        Args:
+            pair: index of the pair.
+        """
         table = Table(caption="poses: mean angle from those of the first step")
         for column in ("step", *self.measures):
             table.add_column(column, justify="right")
@@ -92,7 +99,7 @@ class Interpolation:
         return table
 
     def motion(self, pair: int = 0, fps: float | None = None) -> MotionSet:
-        """Return the steps of a pair as clips, each on its body, starting at the origin with heading zero.
+        """Return the steps of a pair as clips, each on its interpolated body, from the origin with heading zero.
 
         Args:
             pair: index of the pair.
@@ -104,7 +111,7 @@ class Interpolation:
         return replace(motion, clips=clips, name="interpolation")
 
     def vertices(self, pair: int = 0) -> Tensor:
-        """Return surfaces (M, N, V, 3) of a pair in metres."""
+        """Return surfaces (M, N, V, 3) in metres of all steps of the pair with this index."""
         return surfaces_of(self.timed, self.body, self.x[pair], self.shape[pair])
 
     @cached_property
@@ -154,11 +161,11 @@ def transfer(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
 
     Args:
         model: model of segments.
-        batch: x (B, N, D) and beta (B, S).
+        batch: segments, x (B, N, D) and beta (B, S).
         shape: (B, S), beta of the other bodies.
 
     Returns:
-        x (B, N, D).
+        Decoded frames x (B, N, D) for the other bodies.
     """
     with seeded_evaluation(model, 0):
         data = on_device_of(model, batch)
@@ -167,9 +174,9 @@ def transfer(model: Any, batch: Mapping[str, Any], shape: Tensor) -> Tensor:
 
 
 def falls(values: Tensor) -> Tensor:
-    """Return (...,), whether values (..., M) decrease in every step.
+    """Return whether values (..., M) decrease in every step, as booleans (...,).
 
-    Durations between walks and runs should.
+    In an interpolation from a walk to a run, durations should decrease in every step.
     """
     return (values.diff(dim=-1) < 0).all(-1)
 
@@ -184,15 +191,20 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
         labels: label of each segment.
 
     Raises:
-        ValueError: there are too few segments, another number of labels, or too many distinct labels.
+        ValueError: there are too few segments, the number of labels is wrong, or there are too many distinct labels.
     """
     with seeded_evaluation(model, 0):
         means = model.encode(on_device_of(model, batch)).double().cpu()
     if len(means) < 3 or len(labels) != len(means):
-        raise ValueError(f"expected at least 3 segments and a label of each, got {len(means)} and {len(labels)}")
+        raise ValueError(
+            f"expected at least 3 segments and a label for each, got {len(means)} segments and {len(labels)} labels"
+        )
     names = list(dict.fromkeys(labels))
     if len(names) > 10 * len(MARKERS):
-        raise ValueError(f"{len(names)} labels are too many to distinguish; give a label with few values")
+        raise ValueError(
+            f"`labels` has {len(names)} distinct labels, but markers distinguish at most {10 * len(MARKERS)}; use a "
+            "label with fewer values"
+        )
     centred = means - means.mean(0)
     _, spread, axes = torch.linalg.svd(centred, full_matrices=False)
     coordinates, shares = (centred @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()

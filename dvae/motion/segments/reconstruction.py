@@ -1,8 +1,8 @@
 """Reconstruction errors of a latent space of segments, for surfaces and time, compared with principal components.
 
 As in Marsot et al. (2021), arXiv 2106.04387, the mean of the guide is decoded on the segment's own body. The error of a
-segment is the mean distance over frames and vertices. The baseline are principal components of [chi, beta], as many as
-the latent and beta have dimensions, also decoded on the segment's own body.
+segment is the mean distance over frames and vertices. The baseline is a principal component analysis of [chi, beta],
+with as many components as z and beta have dimensions together. It is also decoded on the segment's own body.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ METRICS = {ERROR: Metric("mm"), DURATION: Metric("ms"), **TEACHER_FORCED}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction(Result):
-    """Reconstruction errors of single segments, in rows of models and references.
+    """Reconstruction errors of each segment, with one row per model and per principal component analysis.
 
-    Indexing gives the scores of a row: `found["motion-latent"]["vertex error"].mean`.
+    Indexing by the name of a row returns its scores: `found["motion-latent"]["vertex error"].mean`.
 
     Attributes:
-        rows: row -> score -> values (N,) of the segments.
-        segments: (split, segment, take) of each.
-        fingerprint: SHA-256 of the data.
+        rows: dictionary from row name to score name to the values (N,) of the segments.
+        segments: split, name and take of each segment.
+        fingerprint: SHA-256 of the motion.
         notes: lines below the table.
-        configs: row -> configuration of its run.
+        configs: dictionary from row name to the configuration of the model's run.
     """
 
     rows: Annotated[Mapping[str, Annotated[Mapping[str, np.ndarray], Dims("sequence", name="{}")]], MODELS]
@@ -63,13 +63,21 @@ class Reconstruction(Result):
         return {name: self._score(values) for name, values in self._row(row).items()}
 
     def difference(self, first: str, second: str, score: str = ERROR) -> Score:
-        """Return the paired difference of two rows, first minus second, with its standard error, clustered by take."""
+        """Return the mean paired difference of two rows, first minus second, with a standard error clustered by take.
+
+        Args:
+            first, second: names of the rows.
+            score: name of the score, such as "vertex error" (mm) or "duration error" (ms).
+
+        Raises:
+            KeyError: a row or score does not exist.
+        """
         first_values, second_values = (self._row(row)[score] for row in (first, second))
         return self._score(first_values - second_values)
 
     @override
     def table(self) -> Table:
-        """Return rows by scores: mean over segments with its 95 % interval; for vertices also the median."""
+        """Return a table with one row per model: means over segments with 95 % intervals, and median vertex errors."""
         takes = len({take for _, _, take in self.segments})
         title = f"{len(self.segments)} segments of {takes} takes · data {self.fingerprint[:12]}"
         caption = "mean over segments, with its 95 % interval where there are several takes, by which it is clustered"
@@ -111,7 +119,7 @@ class Reconstruction(Result):
     @override
     def check(self) -> None:
         if self.extents.get("sequence") != {len(self.segments)}:
-            raise ValueError(f"expected numbers of {len(self.segments)} segments")
+            raise ValueError(f"each score in `rows` must have one value for each of {len(self.segments)} segments")
         self.table()
 
     def _row(self, row: str) -> Mapping[str, np.ndarray]:
@@ -127,11 +135,11 @@ class Reconstruction(Result):
 
 @dataclass(frozen=True, eq=False)
 class PrincipalComponents:
-    """The linear latent space of [chi, beta].
+    """Principal component analysis of [chi, beta], as a linear latent space with C dimensions.
 
     Args:
-        mean: (N D + S,).
-        directions: (N D + S, C), orthonormal.
+        mean: (N D + S,), mean of [chi, beta] over the training segments.
+        directions: (N D + S, C), orthonormal columns.
     """
 
     mean: Tensor
@@ -139,7 +147,12 @@ class PrincipalComponents:
 
     @classmethod
     def of(cls, segments: Segments, components: int) -> Self:
-        """Return the first components of segments, or as many as exist."""
+        """Fit the components with the largest variance.
+
+        Args:
+            segments: training segments.
+            components: number of components C; at most one fewer than segments are used.
+        """
         values = _joined(segments.all())
         mean = values.mean(0)
         centred = values - mean  # (B, N D + S): fewer segments than dimensions
@@ -149,14 +162,14 @@ class PrincipalComponents:
         return cls(mean, directions)
 
     def __call__(self, batch: Mapping[str, Any]) -> Tensor:
-        """Return x (B, N, D), projected on the components."""
+        """Return the reconstruction of x (B, N, D), by projecting x and beta (B, S) of a batch on the components."""
         values = _joined(batch) - self.mean
         projected = self.mean + values @ self.directions @ self.directions.T
         return projected[:, : -batch[SHAPE].shape[-1]].view_as(batch[WHOLE])
 
 
 def _joined(batch: Mapping[str, Any]) -> Tensor:
-    """Return [chi, beta], (B, N D + S)."""
+    """Concatenate x and beta of a batch to [chi, beta], (B, N D + S)."""
     return torch.cat([batch[WHOLE].flatten(1), batch[SHAPE]], -1)
 
 
@@ -173,18 +186,21 @@ def reconstruct_segments(
 ) -> Reconstruction:
     """Score the reconstructions of segments by models, and by principal components of the same dimension.
 
-    Each model receives the segments in its own representation (`model.timed`), and is compared with them in it. Vertex
-    errors are in metres in every representation.
+    Models may represent frames differently (`model.timed`). Each model receives and reconstructs the segments in its
+    own representation. Vertex errors are in millimetres in every representation and therefore comparable.
 
     Args:
         models: models by name, such as `motion-latent` models, with `timed`, `encode` and `decode`.
-        segments: test segments with the same kind of body.
-        training: segments for the principal components; None leaves this row out.
+        segments: test segments on the body of the models.
+        training: segments to fit the principal components to; None leaves out their rows.
         bound_particles: number of particles of the IWAE bound and its k-hat; 0 leaves both out.
-        seed: seed of the bounds.
+        seed: seed of the particles.
         batch_size: number of segments at once.
-        configs: row -> configuration, stored as JSON types.
+        configs: dictionary from model name to its configuration in JSON types, which is stored with the result.
         progress: whether to show a progress bar.
+
+    Returns:
+        Vertex errors in mm, duration errors in ms, and bounds in nats per frame, of each segment by model.
 
     Raises:
         ValueError: `models` is empty, or a batch size or number of particles is invalid.
@@ -246,7 +262,7 @@ def _key(timed: TimedFrames) -> str:
 
 
 def _scores(model: Any, segments: Segments, particles: int, batch: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the scores of a batch, (B,) each."""
+    """Return the errors of a model and its bounds in nats per frame for a batch, (B,) each."""
     data = on_device_of(model, batch)
     scores = _errors(segments, model.decode(model.encode(data), data[SHAPE]).cpu(), batch)
     terms = SequenceELBO().terms(model, data)
@@ -258,7 +274,7 @@ def _scores(model: Any, segments: Segments, particles: int, batch: Mapping[str, 
 
 
 def _linear(components: PrincipalComponents, segments: Segments, batch: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the errors of principal components."""
+    """Return the errors of principal components for a batch, (B,) each."""
     return _errors(segments, components(batch), batch)
 
 

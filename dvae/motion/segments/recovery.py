@@ -63,11 +63,12 @@ class Recovered:
 
     Args:
         completed: most probable segments.
-        keys: (split, name) of each.
-        draws: frames (n, B, N, D) and bodies (n, B, S) drawn from the posterior.
-        khat: (B,), from `Posterior.evidence`.
-        distances: mean distances (B,) from the observations in metres by name, from `SegmentCompletion.distances`.
-        truth: x (B, N, D) and beta (B, S), if known.
+        keys: (split, name) of each segment.
+        draws: frames (n, B, N, D) and shape parameters (n, B, S) drawn from the posterior.
+        khat: (B,), k-hat from `Posterior.evidence`; above 0.7, intervals are unreliable.
+        distances: mean distances (B,) in metres from the observations, by name of the observations, from
+            `SegmentCompletion.distances`.
+        truth: true x (B, N, D) and beta (B, S), if known.
     """
 
     completed: Completed
@@ -79,7 +80,10 @@ class Recovered:
 
     @property
     def errors(self) -> dict[str, Tensor]:
-        """Errors (B,) if the truth is known: of vertices in metres, per frame of chi, and of durations in seconds."""
+        """Errors (B,) of the most probable segments by name; empty if the truth is unknown.
+
+        "vertex error" is in metres and compares frames of chi with the same index. "duration error" is in seconds.
+        """
         if self.truth is None:
             return {}
         model, (x, shape), truth = self.completed.model, (self.completed.x, self.completed.shape), self.truth
@@ -92,7 +96,7 @@ class Recovered:
         return {"vertex error": torch.cat(vertices), "duration error": lasts.abs()}
 
     def table(self) -> Group:
-        """Return the results with their intervals and, below, diagnostics; one row per segment in both tables."""
+        """Return two tables, one below the other: results with intervals, and diagnostics; both by segment."""
         timed, draws = self.completed.model.timed, len(self.draws[0])
         measures = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
         errors = {f"from\n{name}\nmm": value for name, value in self.distances.items()}
@@ -126,16 +130,20 @@ class Recovered:
         return Group(results, diagnostics)
 
     def motion(self, draws: int = 0) -> MotionSet:
-        """Return the most probable segments, each followed by some of its draws, as clips.
+        """Return the most probable segments as clips, each followed by some of its draws.
 
-        All clips start at the origin with heading zero."""
+        All clips start at the origin with heading zero.
+
+        Args:
+            draws: number of draws per segment.
+        """
         pairs = zip((self.completed.x, self.completed.shape), self.draws, strict=True)
         x, shape = (torch.cat([mode[None], samples[:draws]]).transpose(0, 1).flatten(0, 1) for mode, samples in pairs)
         ends = ["found", *(f"draw-{n:02d}" for n in range(1, draws + 1))]
         return self._motion(x, shape, [(split, f"{name}-{end}") for split, name in self.keys for end in ends])
 
     def true_motion(self) -> MotionSet | None:
-        """Return the truths, if known, in the same form."""
+        """Return the true segments as clips from the origin with heading zero, or None if they are unknown."""
         return None if self.truth is None else self._motion(self.truth[WHOLE], self.truth[SHAPE], self.keys)
 
     def _motion(self, x: Tensor, shape: Tensor, keys: Sequence[tuple[str, str]]) -> MotionSet:
@@ -163,7 +171,11 @@ def recover(
     Args:
         model, seen, deviations, known, aggregate, descent, seed, progress: same as in `complete`.
         keys: (split, name) of each segment.
-        truth: x (B, N, D) and beta (B, S), if known.
+        truth: true x (B, N, D) and beta (B, S), if known.
+
+    Returns:
+        The completed segments with 200 draws, k-hat, distances from the observations and, if the truth is known,
+        errors.
 
     Raises:
         ValueError: same as `complete`; or a segment has no observations.
@@ -180,9 +192,12 @@ def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
     """Read observations of segments from a file.
 
     Args:
-        path: npz of arrays with the names in `completion`: times or frames; some of surfaces, points and markers; and
-            beta if known. The first axis is omitted for a single segment.
-        model: model of segments.
+        path: npz file with arrays that have the names and shapes in `completion`: times or frames; some of surfaces,
+            points and markers; and beta if known. Arrays of a single segment may omit the first axis.
+        model: model of segments, as in `SegmentCompletion`.
+
+    Returns:
+        Observations for `recover`, in double precision.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -205,7 +220,7 @@ def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """Return arrays of numbers with known names and bounded sizes."""
+    """Read the arrays of an npz file, and raise an error if a name is unknown or the file is too large."""
     names = (TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE)
     with archive(path) as members:
         if unknown := [name for name in members if name not in names]:
@@ -222,10 +237,10 @@ def _check_numbers(name: str, value: Tensor) -> None:
     """Raise an error if there are too many observations, or if they are in the wrong units."""
     if value.dim() > 1 and name != SHAPE and (len(value) > MOST or value.shape[1] > MOST):
         raise ValueError(
-            f"{name} has shape {tuple(value.shape)}; at most {MOST} segments and moments of each are taken"
+            f"{name} has shape {tuple(value.shape)}; expected at most {MOST} segments, with at most {MOST} moments each"
         )
     if name == POINTS and value.shape[1:3].numel() > MOST_POINTS:
-        raise ValueError(f"{name} has shape {tuple(value.shape)}; at most {MOST_POINTS:,} of a segment are taken")
+        raise ValueError(f"{name} has shape {tuple(value.shape)}; expected at most {MOST_POINTS:,} points per segment")
     far = float(value.abs().nan_to_num(0.0, torch.inf).max())
     if name in (SURFACES, POINTS, SPOTS) and far > FARTHEST:
         raise ValueError(
@@ -235,7 +250,7 @@ def _check_numbers(name: str, value: Tensor) -> None:
         low, high = value.nan_to_num(0.0).aminmax()
         raise ValueError(f"times go from {low:g} to {high:g}; expected seconds from the first frame of the segment")
     if name == SHAPE and far > FARTHEST:
-        raise ValueError(f"{name} has {far:g}; expected parameters of shape, which vary about as N(0, 1)")
+        raise ValueError(f"{name} has a value of {far:g}; expected shape parameters, which are about N(0, 1)")
 
 
 def _check_nonempty(seen: Mapping[str, Any]) -> None:
@@ -246,7 +261,7 @@ def _check_nonempty(seen: Mapping[str, Any]) -> None:
     if not (has_observations := moments.any(-1)).all():
         row = int(has_observations.logical_not().nonzero()[0])
         raise ValueError(
-            f"segment {row} of {len(has_observations)}, counted from 0, has no observations: all is NaN; leave it out"
+            f"segment {row} of {len(has_observations)}, counted from 0, has only NaN instead of observations; remove it"
         )
 
 

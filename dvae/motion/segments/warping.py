@@ -27,10 +27,13 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
         ends earlier.
 
     Raises:
-        ValueError: the costs are empty or NaN.
+        ValueError: the costs are empty or NaN, or `longest` is below 1.
     """
     if local.ndim != 2 or not local.size or longest < 1:
-        raise ValueError(f"local costs have shape {local.shape} for at most {longest} frames; expected (M, F), none 0")
+        raise ValueError(
+            f"`local` has shape {local.shape} and `longest` is {longest}; expected (M, F) without empty axes, and at "
+            "least 1"
+        )
     if np.isnan(local).any():
         raise ValueError(f"{np.isnan(local).sum()} of the local costs are NaN; remove frames with missing joints")
     (rows, frames), steps = local.shape, local.shape[0] + longest - 1
@@ -58,20 +61,26 @@ def subsequence_costs(local: np.ndarray, longest: int) -> np.ndarray:
 def alignment(local: np.ndarray) -> tuple[np.ndarray, float]:
     """Align a sequence with a reference, at a pace from half to twice the pace of the reference.
 
-    Steps are one frame in both, or one in one and two in the other. First and last frames are matched.
+    A step of the path advances by one frame in both, or by one frame in one and by two in the other. First frames are
+    matched, and so are last frames.
 
     Args:
-        local: (M, F), with F between M / 2 and 2 M.
+        local: (M, F), cost of each frame of the reference at each frame of the sequence; (M - 1) / 2 <= F - 1 <=
+            2 (M - 1).
 
     Returns:
-        positions (M,) in frames of the sequence, increasing, and the mean local cost on the path.
+        Frame numbers (M,) of the sequence that are aligned with the frames of the reference, increasing; and the mean
+        local cost on the path.
 
     Raises:
-        ValueError: one is more than twice as long as the other.
+        ValueError: sequence or reference is more than twice as long as the other.
     """
     rows, frames = local.shape
     if not (rows - 1) / 2 <= frames - 1 <= 2 * (rows - 1):
-        raise ValueError(f"{frames} frames cannot be warped onto {rows} at a pace from half to twice theirs")
+        raise ValueError(
+            f"a sequence of {frames} frames cannot be aligned with a reference of {rows} frames: one would have to be "
+            "more than twice as fast as the other; resample the sequence"
+        )
     steps = ((1, 1), (1, 2), (2, 1))
     total = np.full((rows + 2, frames + 2), np.inf)  # two rows and columns before the first
     total[2, 2] = local[0, 0]

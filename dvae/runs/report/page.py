@@ -39,7 +39,7 @@ class Section:
 
     Args:
         title: heading.
-        cells: {run: its content}; equal contents are shown once.
+        cells: dictionary from run name to content; equal contents are shown once.
         about: explanation of one or two sentences.
         before: content for all runs together.
     """
@@ -120,7 +120,7 @@ def missing_part(text: str) -> Markup:
 
 
 def command(*words: str) -> Markup:
-    """Return a command to type."""
+    """Return a shell command that the reader can copy."""
     return Markup("<code>{}</code>").format(" ".join(words))
 
 

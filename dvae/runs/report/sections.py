@@ -49,7 +49,7 @@ Runs = Mapping[str, Loaded]
 """Runs by name."""
 
 LARGEST = 2**24
-"""Maximum size in bytes of a record that is shown."""
+"""Maximum size in bytes of a result file that is shown."""
 
 PANEL = 3.0, 2.2
 """Width and height of a small picture in inches; one fits the width of a phone, and two fit half a page."""
@@ -84,7 +84,7 @@ class SelectedWindows:
 
     @property
     def chosen(self) -> list[int]:
-        """Numbers of the selected windows."""
+        """Indices of the selected windows."""
         count = len(self.windows.keys)
         return np.unique(np.linspace(0, count - 1, min(self.most, count)).round().astype(int)).tolist()  # type: ignore[no-any-return]
 
@@ -327,7 +327,7 @@ def posteriors(runs: Runs, windows: HeldOutWindows, seed: int = 0) -> Section:
 
 
 def _evidence(comparison: Comparison, name: str) -> Markup:
-    """Return KL over time and k-hat of one model."""
+    """Return pictures of the KL of every latent over time and of the Pareto k-hat, for one model."""
     row, parts = comparison.rows[name], []
     for latent, steps in list(row.kl_steps.items())[:MOST]:
         figure, axes = _panel(f"KL of {latent}", "step", "nats a step")
@@ -417,7 +417,7 @@ def _command(run: Loaded, name: str) -> Markup:
 
 
 def _record(run: Loaded, name: str) -> str | None:
-    """Return the text of a record of a run; None if it does not exist."""
+    """Return the text of a result file in a run directory; None if it does not exist."""
     try:
         return files.read(run.path / name, LARGEST).decode()
     except FileNotFoundError:
@@ -430,7 +430,7 @@ def _evaluation(run: Loaded) -> Evaluation | None:
 
 
 def _row(run: Loaded, evaluation: Evaluation) -> str | None:
-    """Return the name of a run with its current config in an evaluation; None if it is not there."""
+    """Return the name of the evaluation's row that has the current config of a run; None without such a row."""
     config = plain(Run(run.path).config)
     return next((name for name, row in evaluation.rows.items() if row.config == config), None)
 
@@ -462,7 +462,7 @@ def _facts(run: Loaded) -> dict[str, str]:
 
 
 def _scores(run: Loaded) -> dict[str, str]:
-    """Return the scores of a run in its own evaluation, in words."""
+    """Return the scores of a run from its own evaluation, as texts."""
     try:
         evaluation = _evaluation(run)
         name = None if evaluation is None else _row(run, evaluation)

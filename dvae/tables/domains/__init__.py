@@ -30,7 +30,7 @@ class Domain:
 
     Args:
         place: "module:function" that loads it.
-        description: one sentence.
+        description: one sentence about the data set.
     """
 
     place: str

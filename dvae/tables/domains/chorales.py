@@ -77,7 +77,7 @@ def _panel(settings: Mapping[str, np.ndarray], transposed: bool) -> Panel:
     selected = sorted(different(settings), key=name_hash)[: sum(SIZES.values())]
     if len(selected) < sum(SIZES.values()):
         raise ValueError(
-            f"music21 has {len(selected)} different settings, of {sum(SIZES.values())}; install a newer one"
+            f"music21 has {len(selected)} different settings; expected {sum(SIZES.values())}, install a newer music21"
         )
     splits = [split for split, size in SIZES.items() for _ in range(size)]
     series = []

@@ -79,8 +79,8 @@ def free_running(forecaster, windows, **options):
 def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_frame(model):
     windows = array_windows()
     result = run({"dkf": model}, windows, batch_size=12, training_windows=array_windows(20), seed=3)
-    assert list(result.rows) == ["last value", "nearest neighbours", "dkf"]
-    assert [row.samples for row in result.rows.values()] == [1, 5, 5]
+    assert list(result.rows) == ["last value", "mean", "climatology", "nearest neighbours", "dkf"]
+    assert [row.samples for row in result.rows.values()] == [1, 1, 5, 5, 5]
     x = windows.all()["x"]
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(3)

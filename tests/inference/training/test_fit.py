@@ -6,6 +6,9 @@ import json
 import math
 import pickle
 import signal
+import sys
+import warnings
+from pathlib import Path
 
 import matplotlib
 import pytest
@@ -29,6 +32,8 @@ from dvae.inference.training.trackers import InMemory, JSONLines, TensorBoard
 from dvae.program.model import DynamicalVAE
 
 matplotlib.use("agg")
+
+fit_module = sys.modules[fit.__module__]
 
 
 def run(model=None, train=TRAIN, validation=None, **options):
@@ -497,3 +502,33 @@ def test_a_run_is_fitted_by_one_process_at_a_time(tmp_path):
     with Run(tmp_path).locked(), pytest.raises(CheckpointError, match="another process"):
         run(out=tmp_path)
     assert run(out=tmp_path).status == "finished"
+
+
+# Threads --------------------
+
+
+@pytest.mark.parametrize(
+    ("threads", "cores", "load", "warned"),
+    [(8, 4, 0.0, True), (4, 4, 6.0, True), (4, 4, 4.5, False), (1, 4, 9.0, False)],
+)
+def test_a_fit_warns_of_threads_that_wait_for_a_core(threads, cores, load, warned, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr(fit_module, "CPU_LIMIT", Path("no file"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run(steps=2)
+    messages = [str(each.message) for each in caught]
+    assert bool(messages) == warned
+    assert all(f"torch uses {threads} threads on {cores} cores" in message for message in messages)
+
+
+def test_a_fit_counts_the_cores_that_a_container_may_use(monkeypatch, tmp_path):
+    limit = tmp_path / "cpu.max"
+    limit.write_text("150000 100000\n")
+    monkeypatch.setattr(fit_module, "CPU_LIMIT", limit)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
+    with pytest.warns(UserWarning, match="torch uses 4 threads on 2 cores"):
+        run(steps=2)

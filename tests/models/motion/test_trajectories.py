@@ -340,7 +340,7 @@ def test_paths_are_read_from_files(tmp_path):
     ("text", "message"),
     [
         ("LWrist_x,LWrist_y,LWrist_z\n", "expected"),
-        ("LWrist_x,LWrist_y\n1,2\n", "a column of LWrist is missing"),
+        ("LWrist_x,LWrist_y\n1,2\n", "LWrist needs three columns"),
         ("LWrist_x,LWrist_y,LWrist_z\n1,2\n", "header"),
     ],
 )

@@ -108,13 +108,13 @@ def test_resampling_and_dividing_keep_missing_values():
 
 
 def test_rotations_require_complete_bodies(tmp_path):
-    needs = "has missing joints, so its rotations are not known"
+    needs = "has missing joints, so rotations cannot be computed"
     protocol = replace(motion.PROTOCOLS["simulated"], representation="6d")
     for call in (GAPS.with_rotations, lambda: motion.windows(GAPS, protocol, "train")):
         with pytest.raises(ValueError, match=needs):
             call()
     quaternions = motion.MotionData("simulated", GAPS, replace(protocol, representation="quaternion"))
-    with pytest.raises(ValueError, match=f"{needs}; .* fill its gaps first"):
+    with pytest.raises(ValueError, match=f"{needs}; .* fill in the missing joints first"):
         dvae.method("mix-and-match").build(quaternions.windows("train"))
     people = replace(PEOPLE.with_rotations(), missing=True)
     batch = motion.windows(people, protocol, "test").all()
@@ -122,7 +122,7 @@ def test_rotations_require_complete_bodies(tmp_path):
         motion.windows(people, protocol, "test").schema.view(batch | {"mask": {"x": batch["mask"]}})
     for format in ("bvh", "amass"):
         with pytest.raises(
-            ValueError, match=f"has missing joints, but {format} has no gaps; fill them first.*or write npz"
+            ValueError, match=f"has missing joints, which {format} cannot represent; fill them in first.*or write npz"
         ):
             motion.write_motion(tmp_path / "folder", GAPS, format)
 
@@ -188,7 +188,7 @@ def test_listed_windows_have_observations_in_past_and_future():
     windows = motion.windows(some, motion.PROTOCOLS["simulated"], "train")
     assert {start for _, _, start in windows.keys} == {5, 10, 15}  # 15 frames from 5 on end at 19
     assert len(windows.all()["x"]) == len(windows.keys) == len(windows)
-    with pytest.raises(ValueError, match="no window with the root and another joint"):
+    with pytest.raises(ValueError, match="no usable window: the root and another joint"):
         motion.windows(without(PEOPLE, Pelvis=slice(None)), motion.PROTOCOLS["simulated"], "train")
 
 
@@ -309,12 +309,12 @@ def test_operations_on_complete_bodies_raise_errors_with_advice():
         motion.ExchangedWindows(with_paths)
     data, method = small("trajevae")
     pose = GAPS.clips[0].positions[np.isnan(GAPS.clips[0].positions).any((1, 2))][0]
-    with pytest.raises(ValueError, match=r"the initial pose has no positions of .*fill the gaps first") as error:
+    with pytest.raises(ValueError, match=r"the initial pose has no positions of .*fill them in first") as error:
         method.build(data.schema).complete(pose, frames=5)
     assert "--missing" not in str(error.value)
     flow = dvae.method("moglow", width=4, flow_steps=1)
     data = motion.MotionData("simulated", GAPS, motion.PROTOCOLS["simulated"])
-    with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide them together"):
+    with pytest.raises(ValueError, match=r"hides some entries of a step and not others, .*; hide all of these or none"):
         dvae.fit(flow.build(data.schema), flow.train(data.windows("train"), None, 1), progress=False)
 
 
@@ -433,7 +433,7 @@ def test_gsps_fills_gaps_with_the_motion_nearest_to_all_observations():
         torch.manual_seed(2)
         filled = model.impute({**batch, "x": torch.where(batch["mask"], true, torch.nan)}, 1)["x"][0]
         torch.testing.assert_close(filled, true)
-    with pytest.raises(ValueError, match="gsps fills gaps in windows of 18 frames, not 12"):
+    with pytest.raises(ValueError, match="gsps imputes windows of 18 frames, got 12"):
         model.impute({name: value[:, :12] for name, value in batch.items()})
 
 
@@ -528,7 +528,7 @@ def test_impute_writes_filled_motion_files(fitted, tmp_path, capsys):
     capsys.readouterr()
     for arguments, message in (
         (["--filled", str(tmp_path / "all.bvh")], "can contain one of"),
-        (["--particles", "2", "--out", str(tmp_path / "i.npz")], "--particles chooses among fillings of tables"),
+        (["--particles", "2", "--out", str(tmp_path / "i.npz")], "--particles applies to tables only"),
         ([], "name it with --out or --filled"),
     ):
         assert main([*impute, *arguments]) == 2

@@ -101,12 +101,12 @@ def with_nan(positions):
 
 BAD = [
     (with_nan, "train/walk has NaN .* 1 joint positions in 1 of 10 frames, first RKnee at frame 4"),
-    (lambda p: p[:, :12], "train/walk has 12 joints, skeleton 'walker' has 17"),
+    (lambda p: p[:, :12], "train/walk has 12 joints, but the skeleton 'walker' has 17"),
     (lambda p: p[..., :2], r"train/walk has shape \(10, 17, 2\), expected \(frames, joints, 3\)"),
     (lambda p: p[:0], "train/walk has no frames"),
     (lambda p: p * 1000, r"train/walk shows a person of 1\d{3} m .* millimetres"),
     (lambda p: p * 0.01, "train/walk shows a person of 0.01.* another unit"),
-    (lambda p: p.astype(object), "train/walk holds object"),
+    (lambda p: p.astype(object), "train/walk has dtype object"),
 ]
 
 
@@ -199,7 +199,7 @@ class TestArchive:
 
     def test_a_pickle_outside_positions_3d_is_an_error_before_reading(self, tmp_path):
         path = archive(tmp_path / "a.npz", pickle.dumps(Evil()), name="train/walk")
-        with pytest.raises(ValueError, match="train/walk: holds pickled objects"):
+        with pytest.raises(ValueError, match="train/walk: contains pickled objects"):
             read_motion(path, skeleton=WALKER)
 
 
@@ -273,7 +273,7 @@ class TestPlain:
         assert loaded["test", "clip_0"].labels["mood"] == "glad"
         assert loaded["test", "clip_1"].labels == {}
         for text, message in (
-            ("clip,split\nother,train\n", r"no row names a clip of .*a.npz"),
+            ("clip,split\nother,train\n", r"no row has the split and clip of a clip of .*a.npz"),
             ("name\n", "named clip"),
         ):
             (tmp_path / "mine.csv").write_text(text)
@@ -387,7 +387,7 @@ class TestWindows:
         assert {c.split for c in test.clips} == {"train", "test"}
         with pytest.raises(ValueError, match="label 'style', but clip train/clip_0 does not have it"):
             windows(motion(), protocol, "test")
-        with pytest.raises(KeyError, match="no label 'mood'; there are style"):
+        with pytest.raises(KeyError, match="no clip has the label 'mood'; the labels are style"):
             test.labels("mood")
 
     def test_windows_that_cannot_be_cut_are_errors(self):
@@ -403,7 +403,7 @@ class TestWindows:
                 windows(motion(), protocol, split, length)
         for change, message in (
             ({"observed": 0}, "observed is 0"),
-            ({"heading": True, "rotate": True}, "choose one"),
+            ({"heading": True, "rotate": True}, "set only one"),
             ({"sampling": "uniform"}, "unknown sampling 'uniform'; known: clip, length, subject"),
         ):
             with pytest.raises(ValueError, match=message):

@@ -85,10 +85,10 @@ def test_a_bone_rotates_about_its_own_axes_together_with_its_children(tmp_path):
         ("asf", "length 4", "length four", "length of thigh: 'four' is not a number"),
         ("asf", "direction 0 -1 0", "direction 0 -1", "direction of thigh has 2 numbers"),
         ("asf", "direction 0 -1 0\n", "", "line 15 ends a bone without"),
-        ("asf", "dof rx", "dof rx tx", "expected rx, ry or rz"),
-        ("asf", "order TX", "order RX", "expected TX to RZ"),
+        ("asf", "dof rx", "dof rx tx", "a dof of rx, ry and rz"),
+        ("asf", "order TX", "order RX", "expected TX, TY, TZ, RX, RY and RZ"),
         ("amc", "thigh 90", "thigh 90 1", "line 8 is 'thigh 90 1'"),
-        ("amc", "thigh 90", "", "frame 2 has no row for thigh"),
+        ("amc", "thigh 90", "", "frame 2 has no row for the bone thigh"),
     ],
 )
 def test_a_damaged_file_is_an_error_with_its_line(file, old, new, message, tmp_path):
@@ -103,7 +103,7 @@ def test_a_damaged_file_is_an_error_with_its_line(file, old, new, message, tmp_p
 
 def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):
     (tmp_path / "02_01.amc").write_text(AMC)
-    with pytest.raises(FileNotFoundError, match="which skeleton"):
+    with pytest.raises(FileNotFoundError, match="cannot choose its skeleton"):
         read_amc(tmp_path / "02_01.amc")
     for name in ("01.asf", "02.asf"):
         (tmp_path / name).write_text(ASF if name == "02.asf" else "")
@@ -113,5 +113,5 @@ def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):
 @pytest.mark.parametrize("text", ["", "0 " * 117, "0 " * 233 + "nan"])
 def test_invalid_exponential_maps_are_errors(text, tmp_path):
     (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(ValueError, match=r"expected rows of 117|not a number"):
+    with pytest.raises(ValueError, match=r"expected two or more rows of 117|not a number"):
         read_expmap(tmp_path / "a.txt")

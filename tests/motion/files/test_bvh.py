@@ -156,7 +156,7 @@ def test_written_files_have_the_layout_that_animation_programs_import(tmp_path):
     [
         ("MOTION", "", "line 26 is 'Frames: 2'"),
         ("Frames: 2", "Frames: 200", "expected 200 frames of 12 channels"),
-        ("0.0333333", "0", "not a recording"),
+        ("0.0333333", "0", "a frame time above 0"),
         ("OFFSET 3 0 0", "OFFSET 3 0", "expected three numbers"),
         ("OFFSET 3 0 0", "OFFSET 3 0 inf", "line 17: 'inf' is not a number"),
         ("CHANNELS 2 ", "CHANNELS 3 ", "expected the number of channels"),

@@ -52,7 +52,7 @@ def test_files_are_downloaded_once_to_the_path_of_their_address(url, tmp_path, c
 
 def test_a_file_with_a_wrong_checksum_is_deleted(url, tmp_path):
     (tmp_path / "there" / "02" / "02_01.amc").write_bytes(b"something else")
-    with pytest.raises(ValueError, match=r"02_01\.amc: the file differs from the known one"):
+    with pytest.raises(ValueError, match=r"02_01\.amc: the downloaded file differs from the expected one"):
         download.get("cmu", tmp_path / "here", url)
     assert not (tmp_path / "here" / "02" / "02_01.amc").exists()
 

@@ -36,8 +36,8 @@ def recordings(walkers, tmp_path_factory):
 def test_formats_and_names_that_do_not_fit_are_errors(walkers, tmp_path):
     for path, format, message in (
         ("a.bvh", None, "stores one clip per file, but there are 3"),
-        ("a", None, "which format.*--format"),
-        ("a.csv", "bvh", "which format"),
+        ("a", None, "the format is unknown.*--format"),
+        ("a.csv", "bvh", "the format is unknown"),
         ("a", "npz", "end its name in .npz"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -181,7 +181,7 @@ def test_archives_of_clips_are_joined(walkers, tmp_path, capsys):
     for other, message in (
         (tmp_path / "a.bvh", "is an archive of clips and"),  # which was silently left out
         (paths[0], "occurs twice"),
-        (folder / "z.npz", "z is up, and y in"),
+        (folder / "z.npz", "its up axis is z, but y in"),
     ):
         save(folder / "z.npz", MotionSet([walkers.clips[0]], replace(WALKER, up="z")))
         assert main(["data", "convert", str(paths[0]), str(other), "--out", out]) == 1

@@ -199,7 +199,7 @@ class TestCosines:
 
     def test_skeletons_without_angles_and_other_sizes_are_errors(self):
         stick = Skeleton(("a", "b"), (-1, 0), name="stick")
-        with pytest.raises(ValueError, match="no joint angles for skeleton 'stick': there are some for human36m"):
+        with pytest.raises(ValueError, match=r"defined for the skeletons human36m, .* not for 'stick'"):
             cosines(torch.zeros(3), stick)
         with pytest.raises(ValueError, match="skeleton 'cmu21' has no joint"):
             cosines(torch.zeros(3), Skeleton(("a", "b"), (-1, 0), name="cmu21"))
@@ -218,9 +218,9 @@ class TestLimits:
             assert limits.high[column] == values[:, [left, right]].max()
 
     def test_invalid_input_is_an_error(self):
-        with pytest.raises(ValueError, match=r"quantile is 0\.5"):
+        with pytest.raises(ValueError, match=r"below \.5, got 0\.5"):
             estimate_angle_limits(pose(WALKER), WALKER, quantile=0.5)
         with pytest.raises(ValueError, match="at least one"):
             estimate_angle_limits(torch.zeros(0, 48), WALKER)
-        with pytest.raises(ValueError, match="exceed upper ones, or are not numbers: b"):
+        with pytest.raises(ValueError, match="wrong limits: b"):
             AngleLimits(("a", "b"), torch.tensor([0.0, 1.0]), torch.tensor([0.0, torch.nan]))

@@ -139,9 +139,9 @@ def test_positions_are_scored_by_their_inferred_rotations(people, windows):
 
 def test_wrong_arguments_are_errors(people, windows):
     for options, message in (
-        ({"times": (80, 1000)}, "nearest to 1000 ms: windows of simulated have 12 frames at 30 a second, 400 ms"),
+        ({"times": (80, 1000)}, "nearest to 1000 ms: windows of simulated predict 12 frames at 30 frames per second"),
         ({"times": ()}, "nearest to no time"),
-        ({"counts": (0, 5)}, "at least one, got"),
+        ({"counts": (0, 5)}, "`counts` needs numbers of at least 1"),
         (
             {"models": {"near": Shifts(windows, 0.1)}},
             "a model of positions predicts no rotations; score it with inverse=True",

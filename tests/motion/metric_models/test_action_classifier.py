@@ -155,7 +155,7 @@ def test_a_fitted_classifier_is_loaded_and_resumed(run, file, tmp_path, capsys):
         ),
         (
             lambda: ActionClassifier(**SMALL).resolve_defaults(windows("train", people(ways=("up", "up")))),
-            "needs two classes: training clips have up for",
+            "needs at least two classes: training clips have up for",
         ),
         (
             lambda: ActionClassifier(**SMALL, classes=("up", "left")).train(windows("test")),
@@ -240,9 +240,9 @@ def test_unknown_classes_count_for_fid_only_and_are_reported(fitted):
         (lambda: windows("test", protocol=replace(SHORT, predicted=5)), "fitted to 6 predicted frames at .* have 5 at"),
         (
             lambda: windows("test", motion.simulate(clips=9, frames=40, test=0.4)),
-            "distinguishes ways, but no label 'way'",
+            "distinguishes ways, but no clip has the label 'way'",
         ),
-        (lambda: windows("test", people(3), replace(SHORT, test_stride=99)), "these are 1 windows of 1 clips"),
+        (lambda: windows("test", people(3), replace(SHORT, test_stride=99)), "got 1 windows of 1 clips"),
     ],
 )
 def test_windows_unlike_those_of_a_classifier_are_errors(condition, message, fitted):
@@ -261,7 +261,7 @@ def test_the_command_line_scores_runs_by_classifiers(run, file, tmp_path, capsys
     assert main([*arguments, "--classifier", str(tmp_path / "way")]) == 0
     assert {"ACC way", "path error"} <= Evaluation.load(out)["trajevae"].keys()
     for runs, message in (
-        ([tmp_path / "way"] * 2, "is the second for the label 'way'"),
+        ([tmp_path / "way"] * 2, "is a second classifier of the label 'way'"),
         ([model], "is a fitted trajevae, not an action-classifier"),
         ([run], "was fitted on other data or under another protocol"),
     ):

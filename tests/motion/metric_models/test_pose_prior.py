@@ -121,7 +121,7 @@ def test_a_fitted_prior_is_loaded_and_resumed(run, people, tmp_path, capsys):
     [
         (lambda: PosePrior(layers=0), "layers is 0; it must be at least 1"),
         (lambda: PosePrior(noise=-0.1), "noise is -0.1; it must be at least 0 and below 1"),
-        (lambda: PosePrior(turned=True, heading=True), "heading fixes the direction that turned would draw"),
+        (lambda: PosePrior(turned=True, heading=True), "`heading` fixes the direction that `turned` draws"),
         (lambda: PosePrior().build({"x": 48}), "needs the description of poses, but was given sequences"),
     ],
 )

@@ -142,9 +142,9 @@ def test_wrong_arguments_are_errors(people):
     incomplete = motion.windows(motion.occlude(motion.simulate(8, 40, test=0.5), 0.2, 5.0), SHORT, "test")
     for options, message in (
         ({"people": {**people, "test": other}}, "training and test windows differ in skeleton or frames"),
-        ({"people": {**people, "test": incomplete}}, "these have missing joints; fill the gaps"),
+        ({"people": {**people, "test": incomplete}}, "these have missing joints; fill them in"),
         ({"seeds": ()}, "at least one example and one seed"),
-        ({"models": {"zero velocity": noise}, "references": True}, "must not have the name of a reference row: zero"),
+        ({"models": {"zero velocity": noise}, "references": True}, "the name 'zero velocity' is reserved"),
     ):
         with pytest.raises(ValueError, match=message):
             quality_scores(**{"models": {"noise": noise}, "people": people, **options})
@@ -155,5 +155,5 @@ def test_wrong_arguments_are_errors(people):
     ):
         RealOrGenerated().build({"x": 48})
 
-    with pytest.raises(KeyError, match=r"no model 'nois' here \(did you mean 'noise'\?\)"):
+    with pytest.raises(KeyError, match=r"no model 'nois' in these scores \(did you mean 'noise'\?\)"):
         quality_scores({"noise": noise}, people, steps=1)["nois"]

@@ -129,7 +129,7 @@ class TestEveryEnergy:
             ),
             (
                 lambda x: joint_angles(x[..., :42], LIMITS, HUMANEVA),
-                "limits of the angles Spine2Hip, .* expected the angles of skeleton 'humaneva'",
+                "`limits` has the angles Spine2Hip, .* expected the angles of skeleton 'humaneva'",
             ),
         ],
     )

@@ -86,9 +86,9 @@ def test_the_parent_of_a_kept_joint_is_its_nearest_kept_ancestor():
     assert (renamed.names, renamed.parents) == (("hips", "top"), (-1, 0))
     assert JointSubset.of(WALKER.names, WALKER.parents, [3, 0]).names == ("RFoot", "Pelvis")
     for wrong, message in (
-        (["LFoot", "RFoot"], "their roots are LFoot, RFoot"),
+        (["LFoot", "RFoot"], "now there are the roots LFoot, RFoot"),
         (["Leg"], "no joint 'Leg'"),
-        ([0, 0], "is not one of 17, or occurs twice"),
+        ([0, 0], "is not one of the 17 joints, or is selected twice"),
     ):
         with pytest.raises(ValueError, match=message):
             JointSubset.of(WALKER.names, WALKER.parents, wrong)

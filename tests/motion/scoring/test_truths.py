@@ -132,7 +132,7 @@ def test_limbs_of_length_zero_give_no_nan(people):
 
 
 def test_windows_without_futures_or_heading_are_errors(people, windows, truths):
-    for options, message in (({"threshold": 0}, "threshold above 0"), ({"most": 0}, "stride of at least 1")):
+    for options, message in (({"threshold": 0}, "`threshold` must be above 0"), ({"most": 0}, "`stride` at least 1")):
         with pytest.raises(ValueError, match=message):
             PseudoTruths(windows, **options)
     with pytest.raises(ValueError, match="no future"):

@@ -247,7 +247,7 @@ def test_recovered_segments_are_scored_and_become_motion(model):
         assert abs(clip.positions[:shorter] - true_positions.positions[:shorter]).max() < 0.02
     for table in recovered.table().renderables:
         assert [str(cell) for cell in table.columns[0].cells] == ["a/first", "b/second"]
-    with pytest.raises(ValueError, match="segment 1 of 2, counted from 0, has no observations"):
+    with pytest.raises(ValueError, match="segment 1 of 2, counted from 0, has only NaN"):
         recover(
             model,
             {**observed, "markers": observed["markers"] * torch.tensor([1.0, torch.nan])[:, None, None, None]},

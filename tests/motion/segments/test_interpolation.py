@@ -88,5 +88,5 @@ def test_a_map_shows_labels_and_explained_variance(segments, model):
     assert 100 >= shares[0] >= shares[1] >= 0
     n_points = sum(len(points.get_offsets()) for points in axes.collections)
     assert n_points == len(segments)
-    with pytest.raises(ValueError, match="at least 3 segments and a label of each, got 4 and 2"):
+    with pytest.raises(ValueError, match="at least 3 segments and a label for each, got 4 segments and 2 labels"):
         latent_map(model, segments.all(), labels[:2])

@@ -35,7 +35,7 @@ def test_splits_partition_the_takes_and_segments_have_names(data):
     for name in (first.name, f"{first.split}/{first.name}", first.labels["source"]):
         assert data.segments_of(name).motion.clips[0].key == first.key
     with pytest.raises(
-        ValueError, match=r"no segment or take 'person_00' .did you mean 'person_00.*the first is train"
+        ValueError, match=r"no segment or take 'person_00' .did you mean 'person_00.*the first segment is train"
     ):
         data.segments_of("person_00")
     with pytest.raises(ValueError, match="no split 'all': expected train, validation or test"):
@@ -90,7 +90,7 @@ def test_clips_as_long_as_a_segment_are_segments():
     data = SegmentData("simulated", replace(PEOPLE, clips=clips), "clips")
     assert [clip.frames for clip in data.segments] == [clip.frames for clip in clips if clip.frames > 9]
     assert data.fingerprint != replace(data, cut="gait").fingerprint
-    with pytest.raises(ValueError, match=r"no clip of 0\.3 to 3 s.*cut='gait' finds the gait cycles"):
+    with pytest.raises(ValueError, match=r"uses clips of 0\.3 to 3 s.*cut='gait' finds the gait cycles"):
         assert SegmentData("simulated", replace(PEOPLE, clips=clips[:1]), "clips").segments
 
 
@@ -106,8 +106,8 @@ def test_takes_without_splits_are_assigned_to_one_split_each(count, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda config: config["sizes"].update(turns=10**6), "sizes are .*, expected .* for such segments"),
-        (lambda config: config["timed"]["skeleton"].update(up="z"), "must be the skeleton of the supplied body"),
+        (lambda config: config["sizes"].update(turns=10**6), "sizes are .*, expected .* for the frames in `timed`"),
+        (lambda config: config["timed"]["skeleton"].update(up="z"), "must be the skeleton of the bundled body"),
         (lambda config: config["timed"].update(frames=10**9), "frames is 1000000000; it must be"),
         (lambda config: config["timed"]["references"][0].update(hips=[[1, 0, 0, 0]]), "hips of a reference are"),
     ],

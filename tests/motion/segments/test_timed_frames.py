@@ -108,7 +108,7 @@ def test_invalid_segments_are_errors(people):
         (lambda: view.to(replace(people, clips=[people.clips[0].between(4, 5)])), "has 1 frame, expected at least 2"),
         (lambda: view.to(stranger), "on_common_joints maps two sources to one tree"),
         (lambda: view.back({"x": torch.zeros(1, 99, 76)}), r"expected \(..., 100, 76\)"),
-        (lambda: view.back({"x": incomplete}), "1 of the numbers of frames are NaN or infinite"),
+        (lambda: view.back({"x": incomplete}), "x has 1 NaN or infinite values; all must be finite"),
         (lambda: TimedFrames(replace(skeleton, rest=())), "has no rest pose"),
         (lambda: TimedFrames(replace(skeleton, left=(), right=())), "has no left and right joints"),
         (lambda: TimedFrames(skeleton, mean=(0.0,)), "expected 6 for each of 12 joints"),
