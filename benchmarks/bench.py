@@ -29,7 +29,7 @@ import tyro
 
 import dvae
 
-from .studies.pages import DOCS, refuse_unknown, require_gpu, table, write
+from .studies.results import RESULTS, Table, refuse_unknown, require_gpu, write
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
@@ -166,33 +166,26 @@ def how(record: dict[str, Any]) -> tuple[str, int]:
     return record["machine"].get("device", "cpu"), record["machine"]["threads"]
 
 
-def page(records: list[dict[str, Any]], path: Path | None = DOCS / "results" / "speed.md") -> None:
-    """Write the table of the records measured like the last one, newest first, with the ratio to the release.
-
-    The page has one table for the processor and one for a GPU.
-    """
-    newest = [record for record in records[::-1] if how(record) == how(records[-1])]
-    last, before = newest[0], released(records, records[-1])
+def tabulate(records: list[dict[str, Any]], results: Path = RESULTS) -> None:
+    """Write the table of the last record and of the release; a GPU has a table of its own."""
+    last, before = records[-1], released(records, records[-1])
     lines = []
     for name in sorted(last["rows"], key=_place):
         value, (side, bound) = last["rows"][name], last["targets"].get(name, ("at most", None))
-        number = f"**{value:.2f}**" if bound is not None and met(value, (side, bound)) else f"{value:.2f}"
+        target = ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if met(value, (side, bound)) else "no"]
+        release = f"{before[name][0]:.2f}" if name in before else "–"
         change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
-        earlier = (_number(record["rows"].get(name)) for record in newest[1:4])
-        lines.append([name, "" if bound is None else f"{side} {bound:g}", number, *earlier, change])
-    heads = [f"{record['version']} ({record['commit']}), {record['date']}" for record in newest[:4]]
-    history = table(["", "target", *heads, "last over the release"], lines)
-    write(path, history, name="history" if how(last)[0] == "cpu" else "GPU history")
+        lines.append([name, *target, f"{value:.2f}", release, change])
+    commits = sorted({commit for _, commit in before.values()})
+    note = f"Last: {last['version']} ({last['commit']}), {last['date']}; release: {', '.join(commits) or 'none'}."
+    history = Table(["", "target", "met", "last", "release", "last over release"], lines, note)
+    write(results, {f"speed/{'history' if how(last)[0] == 'cpu' else 'gpu-history'}": history})
 
 
 def _place(row: str) -> int:
     """Of a row's benchmark among all."""
     name = row.partition(":")[0]
     return NAMES.index(name) if name in NAMES else len(NAMES)
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
 
 
 def main(
@@ -209,7 +202,7 @@ def main(
         threads: number of torch threads.
         device: device of models and data. A GPU skips some rows; the output names them.
         out: file of the numbers, written after each benchmark.
-        keep: whether to add the numbers to the history and its page.
+        keep: whether to add the numbers to the history and its table.
     """
     refuse_unknown("benchmark", names, NAMES)
     if device == "cuda":
@@ -266,7 +259,7 @@ def main(
         if keep:
             records = kept(records, written)
             HISTORY.write_text(json.dumps(records, indent=1) + "\n")
-            page(records)
+            tabulate(records)
     for title, lines in (("targets missed:", missed(numbers, targets)), ("slower than at the last release:", failed)):
         if lines:
             print(title, *lines, sep="\n  ")

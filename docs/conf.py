@@ -20,6 +20,7 @@ from sphinx.application import Sphinx  # noqa: E402
 from sphinx.transforms import SphinxTransform  # noqa: E402
 
 import dvae  # noqa: E402
+from benchmarks.studies import results  # noqa: E402
 from dvae.cli.app import COMMANDS  # noqa: E402
 
 project, author = "dvae", "The dvae authors"
@@ -45,6 +46,7 @@ html_theme = "furo"
 html_title = f"dvae {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_js_files = ["sort.js"]
 html_theme_options = {"navigation_with_keys": True}
 templates_path = ["_templates"]
 
@@ -68,6 +70,18 @@ for name in COMMANDS:
     printed = subprocess.run(program, env=os.environ | help_of, capture_output=True, text=True, check=True).stdout
     parts.append(f"\n## dvae {name}\n\n```text\n{printed.strip()}\n```\n")
 (ROOT / "docs" / "reference" / "command_line.md").write_text("".join(parts), encoding="utf-8")
+
+# The appendix has all tables of results, each subject below the text of its README.
+parts = [
+    "# All results\n\nClick on the head of a column to sort a table. `benchmarks/results` contains all tables as CSV.\n"
+]
+for readme in sorted(results.RESULTS.glob("*/README.md")):
+    parts.append("\n#" + readme.read_text(encoding="utf-8"))
+    for file in sorted(readme.parent.glob("*.csv")):
+        table = results.read(f"{readme.parent.name}/{file.stem}")
+        parts.append(f"\n### {readme.parent.name}/{file.stem}\n\n{table.note}\n\n")
+        parts.append(f"```{{table}}\n:class: sortable\n\n{table.markdown()}```\n")
+(ROOT / "docs" / "results" / "appendix.md").write_text("".join(parts), encoding="utf-8")
 
 # Notebooks run in a temporary folder with this tree's code, and again only after a change.
 os.environ.update(PYTHONPATH=str(ROOT), OMP_NUM_THREADS="1", PYTHONWARNINGS="ignore:IProgress not found")
@@ -136,8 +150,8 @@ class LinkNames(SphinxTransform):
     def apply(self, **_: object) -> None:
         """Replace each such name by a link."""
         for literal in list(self.document.findall(nodes.literal)):
-            name = literal.astext().partition("(")[0]
-            if not re.fullmatch(r"dvae(\.\w+)+", name) or isinstance(literal.parent, nodes.reference | nodes.title):
+            name, linked = literal.astext().partition("(")[0], nodes.reference | nodes.title | pending_xref
+            if not re.fullmatch(r"dvae(\.\w+)+", name) or isinstance(literal.parent, linked):
                 continue
             link = pending_xref("", refdomain="py", reftype="obj", reftarget=name, refexplicit=True, refwarn=False)
             literal.replace_self(link)

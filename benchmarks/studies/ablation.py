@@ -1,4 +1,4 @@
-"""Writes the tables and the picture of docs/ablation.md: what edges are worth, on surrogates and fitted."""
+"""Write tables and a picture of what edges are worth, on surrogates and fitted."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from dvae.inference.evaluation.estimates import number
 from dvae.runs.ablation import AblatedEdge
 
 from .audits import FAMILY, spread
-from .pages import DOCS, code, words, write
+from .results import DOCS, Table, write
 
 NAMES = ("DKF", "SRNN", "DSAE")
 LEVEL = ("p(z_t | z_{t-1}) p(x_t | z_t)", "faithful")
@@ -21,12 +21,12 @@ SENSORS = (1.0, 0.7, 0.5)
 KEEPS, MOVES, NOISE, STEPS = 0.95, 0.3, 0.5, 20
 
 
-def surrogates(names: tuple[str, ...], steps: int, seeds: int) -> str:
+def surrogates(names: tuple[str, ...], steps: int, seeds: int) -> Table:
     """What each edge of some models is worth."""
     models = {name: FAMILY[name][0] for name in names}
     costs = {name: dvae.model_edge_costs(model, steps=steps, seeds=seeds) for name, model in models.items()}
-    rows = [(n, code(models[n]), code(edge), spread(cost)) for n in names for edge, cost in costs[n].items()]
-    return words("", "model", "edge", "cost of leaving it out", rows=rows)
+    rows = [(n, f"`{models[n]}`", f"`{edge}`", spread(cost)) for n in names for edge, cost in costs[n].items()]
+    return Table(["", "model", "edge", "cost of leaving it out"], rows)
 
 
 def sensors(path: Path, sequences: int = 600) -> dvae.tables.PanelData:
@@ -61,21 +61,21 @@ def exact(edge: AblatedEdge, found: dvae.Ablation) -> float:
     return dvae.Oracle(model, STEPS).fit_guide() / STEPS
 
 
-def fitted(found: dvae.Ablation) -> str:
+def fitted(found: dvae.Ablation) -> Table:
     """All costs of each edge."""
     lines = []
     for edge in found.edges:
         costs, estimate = torch.tensor(found.costs[edge.run]), found.differences[edge.run]
         low, high = map(number, estimate.interval())
         cells = [spread(costs), str(estimate), f"{low} to {high}", number(found.p_values[edge.run])]
-        lines.append([code(edge.name), edge.of, *cells, f"{exact(edge, found):.3f}"])
+        lines.append([f"`{edge.name}`", edge.of, *cells, f"{exact(edge, found):.3f}"])
     head = ("edge", "of", "on surrogates, nats a sequence", "fitted, nats a step", "95 %", "p", "exact, nats a step")
-    return words(*head, rows=lines)
+    return Table(head, lines)
 
 
 def main(
     runs: Path,
-    page: Path = DOCS / "ablation.md",
+    results: Path | None = None,
     picture: Path = DOCS / "img" / "ablation.png",
     steps: int = 5,
     seeds: int = 5,
@@ -86,21 +86,21 @@ def main(
 
     Args:
         runs: directory of the fits, which are continued where they stopped.
-        page: where the tables go.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         picture: where the drawing goes.
         steps: of the sequences on surrogates.
         seeds: surrogates of random weights.
         fitting: steps of a fit.
         jobs: fits at a time.
     """
-    write(page, surrogates(NAMES, steps, seeds), name="surrogates")
+    write(results, {"ablation/surrogates": surrogates(NAMES, steps, seeds)})
     generative, inference = LEVEL
     method = dvae.method("equations", generative=generative, inference=inference, latent=1, width=16, warm_up=100)
     data = sensors(runs / "sensors.npz")
     on_surrogates = {"sizes": {"z": 1, "x": len(SENSORS)}, "steps": steps, "surrogates": seeds}
     found = dvae.ablate(method, data, runs, (0, 1, 2), {**TRAINING, "steps": fitting}, jobs, **on_surrogates)
     found.save(runs / "edges.json")
-    write(page, fitted(found), name="fitted")
+    write(results, {"ablation/fitted": fitted(found)})
     found.plot().savefig(picture, dpi=100)
 
 

@@ -1,4 +1,4 @@
-"""Writes the tables of docs/audits.md: what guides miss, what that costs, and guides that miss nothing."""
+"""Write tables of what guides miss, what that costs, and of guides that miss nothing."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ import dvae
 from dvae.inference.evaluation.estimates import number
 
 from .engine import settings
-from .pages import DOCS, code, table, words, write
+from .results import Table, write
 
 FAMILY: dict[str, tuple[str, str]] = settings(__file__)
 DERIVED = ("DKF", "SRNN", "DSAE", "HiT-DVAE", "two layers")
@@ -23,44 +23,44 @@ def spread(cost: torch.Tensor) -> str:
     return f"{mean} ({least} to {largest})"
 
 
-def derived(names: Sequence[str]) -> str:
+def derived(names: Sequence[str]) -> Table:
     """Return a table of the guides of some models without missing dependencies, with their cost."""
-    rows = [(name, code(guide), *rest) for name in names for guide, *rest in dvae.alternatives(FAMILY[name][0]).rows]
-    return table(["", "guide", "drawn", "edges", "looped", "KL by draws"], rows, "|---|---|---|---:|---|---|")
+    rows = [(name, f"`{guide}`", *rest) for name in names for guide, *rest in dvae.alternatives(FAMILY[name][0]).rows]
+    return Table(["", "guide", "drawn", "edges", "looped", "KL by draws"], rows)
 
 
-def edge_rows(names: Sequence[str], steps: int, seeds: int) -> str:
+def edge_rows(names: Sequence[str], steps: int, seeds: int) -> Table:
     """Return a table of the cost of leaving out each edge of the derived guide."""
     costs = {name: dvae.edge_costs(FAMILY[name][0], steps=steps, seeds=seeds) for name in names}
-    rows = [(name, code(edge), spread(cost)) for name, each in costs.items() for edge, cost in each.items()]
-    return words("", "edge", "cost of leaving it out", rows=rows)
+    rows = [(name, f"`{edge}`", spread(cost)) for name, each in costs.items() for edge, cost in each.items()]
+    return Table(["", "edge", "cost of leaving it out"], rows)
 
 
 def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> list[str]:
     """A line of the table."""
     audit = dvae.audit(generative, inference)
     missing, redundant = (
-        ", ".join(code(term) for terms in found.values() for term in terms) or "–"
+        ", ".join(f"`{term}`" for terms in found.values() for term in terms) or "–"
         for found in (audit.missing, audit.redundant)
     )
     sizes = dict.fromkeys((*audit.generative.variables,), 1)
     cost = dvae.kl_gap(generative, inference, sizes, steps=steps, seeds=seeds)
-    return [name, code(generative), code(inference), missing, redundant, spread(cost)]
+    return [name, f"`{generative}`", f"`{inference}`", missing, redundant, spread(cost)]
 
 
-def main(page: Path = DOCS / "audits.md", steps: int = 5, seeds: int = 5) -> None:
+def main(results: Path | None = None, steps: int = 5, seeds: int = 5) -> None:
     """Write the tables.
 
     Args:
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         steps: of the sequences whose cost is computed.
         seeds: models of random weights.
     """
     rows = [row(name, *equations, steps, seeds) for name, equations in FAMILY.items()]
-    write(page, words("", "model", "guide", "missing", "redundant", "cost", rows=rows))
+    guides = Table(["", "model", "guide", "missing", "redundant", "cost"], rows)
     names = [name for name in DERIVED if name in FAMILY]
-    write(page, derived(names), name="derived")
-    write(page, edge_rows(names, steps, seeds), name="edges")
+    edges = edge_rows(names, steps, seeds)
+    write(results, {"audits/guides": guides, "audits/derived": derived(names), "audits/edges": edges})
 
 
 if __name__ == "__main__":

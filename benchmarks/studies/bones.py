@@ -1,6 +1,6 @@
-"""Write the tables of docs/results/bones.md from runs, evaluated on a part of their test windows.
+"""Write tables of runs of each method without `bones` and with it, evaluated on a part of their test windows.
 
-The page describes the fits of each method without `bones` and with it. Results of a run are stored in its directory.
+Results of a run are stored in its directory.
 """
 
 import sys
@@ -14,7 +14,7 @@ import tyro
 import dvae
 from dvae import motion
 
-from .pages import DOCS, loaded, same, table, write
+from .results import Table, loaded, same, write
 
 METRICS = ("bone-length error", "limb stretch", "limb jitter", "ADE", "FDE", "APD", "MMADE", "limb-angle error", "CMD")
 COMPARED = ("ADE", "FDE", "APD", "limb-angle error")
@@ -49,7 +49,7 @@ def joined(files: Sequence[Path]) -> dvae.Evaluation:
 
 def main(
     runs: tyro.conf.Positional[tuple[Path, ...]],
-    page: Path = DOCS / "results" / "bones.md",
+    results: Path | None = None,
     every: int = 4,
     samples: int = 50,
 ) -> None:
@@ -57,7 +57,7 @@ def main(
 
     Args:
         runs: directories; each run without bones, and then the same with them.
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         every: the test windows that are scored, each so many-th.
         samples: futures of each.
     """
@@ -77,7 +77,8 @@ def main(
         for theirs, ours in pairs
     ]
     scores = [[name, *(str(evaluation[name].get(metric, "–")) for metric in METRICS)] for name in evaluation.rows]
-    write(page, table(["", *METRICS], scores), table(["", *COMPARED, "ADE, relative"], rows))
+    differences = Table(["", *COMPARED, "ADE, relative"], rows)
+    write(results, {"bones/scores": Table(["", *METRICS], scores), "bones/differences": differences})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes the tables of docs/bounds.md: what estimators of the evidence give where it is known."""
+"""Write tables of what estimators of the evidence give where it is known."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import tyro
 
 import dvae
 
-from .pages import DOCS, code, words, write
+from .results import Table, write
 
 MODEL = "p(z_t | z_{t-1}) p(x_t | z_t)"
 GUIDES = {
@@ -40,7 +40,7 @@ def annealed(name: str, inference: str, steps: int, sequences: int, particles: i
         for start in (None, {"z": drawn["z"]}):
             gap = dvae.annealed_bound(model, drawn["x"], temperatures, particles, latents=start).bound - evidence
             cells.append(f"{gap.mean():.3f} ± {gap.std() / sequences**0.5:.3f}")
-    return [f"{code(inference)}, {name}", *cells]
+    return [f"`{inference}`, {name}", *cells]
 
 
 def row(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> list[str]:
@@ -53,11 +53,11 @@ def row(name: str, inference: str, steps: int, sequences: int, particles: int, f
     bounds += [dvae.fivo_bound(model, x, particles, resample_below=share).bound for share in (0.25, 0.5, 1.0)]
     gaps = [evidence - bound for bound in bounds]
     cells = [f"{gap.mean():.2f} ± {gap.std() / sequences**0.5:.2f}" for gap in gaps]
-    return [f"{code(inference)}, {name}", f"{exact:.2f}", *cells]
+    return [f"`{inference}`, {name}", f"{exact:.2f}", *cells]
 
 
 def main(
-    page: Path = DOCS / "bounds.md",
+    results: Path | None = None,
     steps: int = 100,
     sequences: int = 200,
     particles: int = 16,
@@ -67,7 +67,7 @@ def main(
     """Write the tables.
 
     Args:
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         steps: of a sequence.
         sequences: over which is averaged.
         particles: of IWAE and FIVO.
@@ -75,10 +75,10 @@ def main(
         sides: sequences of the table of bounds from both sides.
     """
     head = ("guide", "ELBO (exact)", "IWAE", "FIVO, resampled below .25 K", "below .5 K", "always")
-    write(page, words(*head, rows=[row(*guide, steps, sequences, particles, fitting) for guide in GUIDES.items()]))
-    columns = [f"{side}, L = {number}" for number in TEMPERATURES for side in ("lower", "upper")]
+    estimates = Table(head, [row(*guide, steps, sequences, particles, fitting) for guide in GUIDES.items()])
+    columns = ["guide"] + [f"{side}, L = {number}" for number in TEMPERATURES for side in ("lower", "upper")]
     rows = [annealed(*guide, steps, sides, particles, fitting) for guide in GUIDES.items()]
-    write(page, words("guide", *columns, rows=rows), name="sides")
+    write(results, {"bounds/estimates": estimates, "bounds/sides": Table(columns, rows)})
 
 
 if __name__ == "__main__":

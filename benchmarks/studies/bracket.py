@@ -1,4 +1,4 @@
-"""Write the tables of docs/bounds.md that divide the gap between evidence and ELBO into its causes.
+"""Write tables that divide the gap between evidence and ELBO into its causes.
 
 They cover guides of a model with known evidence, and runs. Brackets of runs are stored in `KEPT` by the name of the
 run and are not computed again.
@@ -14,7 +14,7 @@ import dvae
 from dvae.inference.diagnostics.bracket import format_estimate
 
 from .bounds import GUIDES, fitted
-from .pages import DOCS, code, loaded, table, write
+from .results import Table, loaded, write
 
 SETTINGS: dict[str, Any] = {"particles": 32, "temperatures": 20, "chains": 4}
 
@@ -31,7 +31,7 @@ def known(name: str, inference: str, steps: int, count: int, fitting: int) -> li
     parts = [format_estimate(gap[part]) for part in ("amortisation", "missing edges", "family")]
     error = f"{off.mean():.3f} ± {off.std() / count**0.5:.3f}"
     return [
-        f"{code(inference)}, {name}",
+        f"`{inference}`, {name}",
         f"{(evidence - oracle.bound(x)).mean():.2f}",
         *parts,
         error,
@@ -57,13 +57,13 @@ def row(name: str, found: dvae.Bracket) -> list[str]:
     ]
     parts = [real.get(part) for part in ("amortisation", "missing edges", "family")]
     cells = ["–" if each is None else format_estimate(each) for each in (*above, *parts, simulated["unknown"])]
-    return [f"{name}, {code(found.equations['inference'])}", *cells]
+    return [f"{name}, `{found.equations['inference']}`", *cells]
 
 
 def main(
     runs: tyro.conf.Positional[tuple[Path, ...]],
     kept: Path,
-    page: Path | None = DOCS / "bounds.md",
+    results: Path | None = None,
     count: int = 16,
     fitting: int = 150,
     reach: int = 8,
@@ -74,7 +74,7 @@ def main(
     Args:
         runs: directories.
         kept: directory of brackets.
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         count: windows of each run, and sequences of the known model.
         fitting: steps of semi-amortized guides.
         reach: steps between latents of runs that semi-amortized guides read linearly, at most.
@@ -84,10 +84,10 @@ def main(
     kept.mkdir(parents=True, exist_ok=True)
     parts = ["amortisation", "missing edges", "family"]
     rows = [known(name, inference, steps, count, fitting) for name, inference in GUIDES.items()]
-    write(page, table(["", "evidence - ELBO", *parts, "AIS - evidence", "upper - AIS"], rows), name="parts")
+    write(results, {"bounds/parts": Table(["", "evidence - ELBO", *parts, "AIS - evidence", "upper - AIS"], rows)})
     rows = [row(run.name, bracketed(run, kept, count, fitting, reach)) for run in runs]
     columns = ["", "IWAE", "FIVO", "AIS", *parts, "upper - AIS, simulated"]
-    write(page, table(columns, rows), name="bracket")
+    write(results, {"bounds/runs": Table(columns, rows)})
 
 
 if __name__ == "__main__":

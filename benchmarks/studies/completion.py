@@ -48,10 +48,10 @@ from dvae.motion.segments.dataset import SegmentData, subsample_clips
 from dvae.motion.segments.embodied import SHAPE, Segments
 
 from .engine import OURS, Row, fitted, folder, interval, kept, read_all, spread
-from .pages import DOCS, refuse_unknown, table, tabled, write
+from .results import DOCS, Table, refuse_unknown, tabled, write
 
 PARTS = ("prediction", "completion", "uncertainty", "tuning")
-MARKS, TUNING = "completion", "tuning"
+TUNING = "tuning"
 DEVIATIONS, DESCENT = Deviations(), dvae.Descent()
 """Chosen by the part "tuning"."""
 SECONDS, HORIZON = 0.25, 1.2
@@ -140,9 +140,9 @@ class Beginning:
 
 
 SIGHTS = {
-    "7a": [Sight(points, ALL, markers) for points in POINTS for markers in (False, True)],
-    "7b": [Sight(FEW, frames, markers) for frames in FRAMES for markers in (False, True)],
-    "markers alone": [Sight(0, frames, True) for frames in FRAMES],
+    "points": [Sight(points, ALL, markers) for points in POINTS for markers in (False, True)],
+    "frames": [Sight(FEW, frames, markers) for frames in FRAMES for markers in (False, True)],
+    "markers": [Sight(0, frames, True) for frames in FRAMES],
 }
 SURE = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
 """Of which intervals are judged, and deviations chosen, each one of a kind."""
@@ -431,7 +431,7 @@ def curves(out: Path) -> dict[str, Row]:
     return {name: replace(row, name=name) for name, row in named.items() if row is not None}
 
 
-def by_time(drawn: Mapping[str, Row]) -> str:
+def by_time(drawn: Mapping[str, Row]) -> Table:
     """Rows down, time across in tenths of a second; and how much less is off than residual-sup's."""
     first = next(iter(drawn.values()))
     times = [time for time in first.runs[0]["times"] if time > SECONDS and abs(10 * time - round(10 * time)) < 1e-3]
@@ -440,7 +440,7 @@ def by_time(drawn: Mapping[str, Row]) -> str:
         less = [drawn[OURS].estimate(at(time), drawn[SUP]) for time in times]
         lines.append([f"{OURS} minus {SUP}, 95 %", *(interval(each, alone=True) for each in less)])
     lines.append(["segments", *(str(int(np.isfinite(first.values(at(time))[0]).sum())) for time in times)])
-    return table(["mm", *(f"{time:.1f} s" for time in times)], lines)
+    return Table(["mm", *(f"{time:.1f} s" for time in times)], lines)
 
 
 def of_sights(out: Path, sights: Iterable[Any], name: str = "{}") -> dict[Any, Row]:
@@ -449,7 +449,7 @@ def of_sights(out: Path, sights: Iterable[Any], name: str = "{}") -> dict[Any, R
     return {sight: row for sight, row in found.items() if row is not None}
 
 
-def completions(found: Mapping[Sight, Row]) -> str:
+def completions(found: Mapping[Sight, Row]) -> Table:
     """Return a table of errors, one row for each observation."""
 
     def more(sight: Sight) -> str:
@@ -471,7 +471,7 @@ def completions(found: Mapping[Sight, Row]) -> str:
     return tabled({str(sight): sight for sight in found}, columns, "seen")
 
 
-def sureness(found: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> str:
+def sureness(found: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> Table:
     """Return a table of interval coverage and convergence, one row for each observation or setting."""
 
     def share(row: Row, name: str, off: Callable[[np.ndarray], np.ndarray]) -> str:
@@ -492,18 +492,19 @@ def sureness(found: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> str:
     return tabled({str(name): row for name, row in found.items()}, columns)
 
 
-def tables(out: Path) -> list[str]:
-    """Return all available tables, with headings."""
-    found = []
+def tables(out: Path) -> dict[str, Table]:
+    """Return all available tables."""
+    found = {}
     if drawn := curves(out):
-        found += ["### Prediction\n", by_time(drawn)]
-    if crossed := [there for sights in SIGHTS.values() if (there := of_sights(out, sights))]:
-        found += ["### Completion\n", *map(completions, crossed)]
+        found["prediction"] = by_time(drawn)
+    for across, sights in SIGHTS.items():
+        if there := of_sights(out, sights):
+            found[f"completion-{across}"] = completions(there)
     if sure := of_sights(out, SURE, "sure of {}"):
-        found += ["### Uncertainty\n", sureness(sure)]
+        found["completion-uncertainty"] = sureness(sure)
     if chosen := of_sights(out, tried()):
-        found += ["### Tuning\n", sureness(chosen, levels=LEVELS[1:2])]
-    return found
+        found["completion-tuning"] = sureness(chosen, levels=LEVELS[1:2])
+    return {f"motion_latent_4d/{name}": table for name, table in found.items()}
 
 
 def draw(out: Path, file: Path) -> None:
@@ -568,7 +569,7 @@ def main(
     runs: tuple[Path, ...] = (),
     tuned: Path | None = None,
     out: Path = Path("runs/completion"),
-    page: Path | None = None,
+    results: Path | None = None,
     picture: Path = DOCS / "img" / "motion_latent_completion.png",
     parts: tuple[str, ...] = ("prediction", "completion", "uncertainty"),
     budget: Budget = Budget(),
@@ -580,7 +581,7 @@ def main(
         runs: directories of fitted runs, one per seed; the study fits as many of residual-sup.
         tuned: directory of a run fitted on file group A.
         out: directory of the measurements, in a folder per run.
-        page: page of the tables; None prints them.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         picture: file of the picture of errors over time and completions.
         parts: prediction, completion, uncertainty, tuning.
         budget: limits of computation.
@@ -601,7 +602,7 @@ def main(
         held = Held(tuned, data, budget, some=True, grouped=True)
         for name, choice in tried().items():
             kept(out / TUNING / f"{folder(name)}.json", partial(certain, held, *choice))
-    write(page, *tables(out), name=MARKS)
+    write(results, tables(out))
     draw(out, picture)
 
 

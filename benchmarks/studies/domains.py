@@ -1,4 +1,4 @@
-"""Fit and score the models of docs/results/domains.md on real data other than motion, and write its tables.
+"""Fit and score models on real data other than motion, and write their tables.
 
 Each run has a directory under `--runs`, with a file of scores for each scored part. An interrupted script continues and
 skips existing files, and two processes may work on other domains, cases or seeds at once. Options are chosen with
@@ -26,7 +26,7 @@ from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 
 from .engine import OURS, Row, cell, fitted, measure, read, scores_of, settings
-from .pages import DOCS, ordered, table, tabled, write
+from .results import Table, ordered, tabled, write
 
 FORECASTS = 100
 BASELINE = "autoregressive"
@@ -183,7 +183,7 @@ def measured(model: Any, case: str, data: Data, part: str, seed: int) -> dict[st
 
 
 def shown(windows: Any) -> list[Measure]:
-    """Return the scores of the page, in the unit of the data."""
+    """Return the scores of the tables, in the unit of the data."""
     return [CRPS, ENERGY, *map(coverage_at, LEVELS)]
 
 
@@ -235,7 +235,7 @@ def unreliable(row: Row) -> str:
     return f"{100 * float((khat > 0.7).mean()):.0f} %" if latents(row) and np.isfinite(khat).all() else "–"
 
 
-def bounds(cases: Mapping[str, Row], section: Section) -> str:
+def bounds(cases: Mapping[str, Row], section: Section, note: str) -> Table:
     """Cases down, best first, bounds across."""
     baseline = cases.get(BASELINE)
     columns: dict[str, Callable[[Row], str]] = {
@@ -248,52 +248,51 @@ def bounds(cases: Mapping[str, Row], section: Section) -> str:
         "weights": lambda row: f"{row.runs[0]['parameters']:,}",
         "s a fit": lambda row: f"{np.mean([run['seconds'] for run in row.runs]):.0f}",
     }
-    return tabled(ordered(cases, lambda row: -mean(row, "bounds", BOUND)), columns)
+    return tabled(ordered(cases, lambda row: -mean(row, "bounds", BOUND)), columns, note=note)
 
 
-def of_forecasts(cases: Mapping[str, Row]) -> str:
+def of_forecasts(cases: Mapping[str, Row], note: str) -> Table:
     """Cases and references down, the best CRPS first, scores of forecasts across; only draws have intervals."""
     first = [run for row in cases.values() for run in row.runs if len(run["forecasts"]["rows"]) > 1]
     beside = {name: Row(first, name, trained=False) for run in first for name in run["forecasts"]["rows"]}
     found = {**cases, **{name: row for name, row in beside.items() if name != OURS}}
     columns = {score: partial(said, part="forecasts", score=score) for score in SHOWN}
-    return tabled(ordered(found, lambda row: mean(row, "forecasts", "CRPS")), columns)
+    return tabled(ordered(found, lambda row: mean(row, "forecasts", "CRPS")), columns, note=note)
 
 
-def sound(cases: Mapping[str, Row]) -> str:
+def sound(cases: Mapping[str, Row]) -> Table:
     """Cases by how well their resynthesis sounds."""
     order = ordered(cases, lambda row: -mean(row, "sound", SDR))
     lines = [[name, said(row, "sound", SDR), f"{REVIEW[name]:.1f}"] for name, row in order.items() if latents(row)]
-    return table(["", "SI-SDR, dB", "the review's, of other speech"], lines)
+    return Table(["", "SI-SDR, dB", "the review's, of other speech"], lines, "Resynthesis from the posterior.")
 
 
-def tables(runs: Path, part: str) -> list[str]:
+def tables(runs: Path, part: str) -> dict[str, Table]:
     """Return the tables of the scores on a part."""
-    parts = []
+    found = {}
     for name, section in SECTIONS.items():
         cases = read(runs / name, section.cases, f"{part}.json")
         if not cases:
             continue
         first, cut = next(iter(cases.values())).runs, section.forecast
         own, minutes = first[0]["bounds"], sum(run["seconds"] for row in cases.values() for run in row.runs) / 60
-        parts += [
-            f"### {name.capitalize()}, {part}\n",
-            f"{len({*own['clips']})} sequences, {sum(own['weights'])} steps; {len(first)} seeds; all fits took "
-            f"{minutes:.0f} minutes of processor time.\n",
-            bounds(cases, section),
-        ]
+        note = (
+            f"{part.capitalize()}: {len({*own['clips']})} sequences, {sum(own['weights'])} steps; {len(first)} seeds; "
+        )
+        note += f"all fits took {minutes:.0f} minutes of processor time."
+        found[f"domains/{name}-bounds"] = bounds(cases, section, note)
         if "sound" in first[0]:
-            parts += ["Resynthesis from the posterior:\n", sound(cases)]
+            found[f"domains/{name}-sound"] = sound(cases)
         if "forecasts" in first[0]:
-            made = f"Forecasts of {cut.horizon} steps from {cut.observed}, {FORECASTS} draws:\n"
-            parts += [made, of_forecasts(cases)]
-    return parts
+            note = f"Forecasts of {cut.horizon} steps from {cut.observed}, {FORECASTS} draws."
+            found[f"domains/{name}-forecasts"] = of_forecasts(cases, note)
+    return found
 
 
 def main(
     domains: tuple[str, ...] = ("chorales",),
     runs: Path = Path("runs/domains"),
-    page: Path | None = DOCS / "results" / "domains.md",
+    results: Path | None = None,
     part: Literal["validation", "test"] = "validation",
     cases: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0,),
@@ -303,7 +302,7 @@ def main(
     Args:
         domains: names of domains to fit; empty to write the tables only.
         runs: folder of the runs.
-        page: page of the tables; None prints them.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         part: split to score and to show in the tables.
         cases: names of cases to fit; all cases of a domain if empty.
         seeds: seeds of the runs to fit.
@@ -311,7 +310,7 @@ def main(
     torch.set_num_threads(1)
     for name in domains:
         measure(runs / name, cases or SECTIONS[name].cases, seeds, partial(run, Data(name), part), f"{part}.json")
-    write(page, *tables(runs, part))
+    write(results, tables(runs, part))
 
 
 if __name__ == "__main__":

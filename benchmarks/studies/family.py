@@ -1,7 +1,4 @@
-"""Write the tables of docs/results/family.md from comparisons.
-
-The page describes a comparison. Comparisons of other models on the same windows are joined.
-"""
+"""Write tables of comparisons; comparisons of other models on the same windows are joined."""
 
 from collections.abc import Callable
 from functools import reduce
@@ -12,13 +9,13 @@ import tyro
 import dvae
 
 from .engine import said
-from .pages import DOCS, ordered, tabled, write
+from .results import Table, ordered, tabled, write
 
 DIGITS = {"ADE": 3, "FDE": 3, "MMADE": 3, "MMFDE": 3, "APD": 2, "energy score": 2}
 ARROWS = {"ADE": " ↓", "FDE": " ↓", "MMADE": " ↓", "MMFDE": " ↓", "energy score": " ↓"}
 
 
-def tables(comparison: dvae.Comparison) -> list[str]:
+def tables(comparison: dvae.Comparison) -> dict[str, Table]:
     """Return the teacher-forced scores in the order of the ranking, then free-running ones by energy score."""
     best, *_ = ranking = comparison.ranking
 
@@ -40,22 +37,22 @@ def tables(comparison: dvae.Comparison) -> list[str]:
         for score, digits in DIGITS.items()
     }
     order = ordered({name: name for name in ranking}, lambda name: comparison[name]["energy score"].mean)
-    return [
-        f"Teacher-forced, nats a frame ({len(comparison.keys)} windows):\n",
-        tabled({name: name for name in ranking}, forced),
-        f"Free-running, {comparison.samples} forecasts a window, metres:\n",
-        tabled(order, free),
-    ]
+    windows = f"Teacher-forced, nats a frame ({len(comparison.keys)} windows)."
+    draws = f"Free-running, {comparison.samples} forecasts a window, metres."
+    return {
+        "family/teacher-forced": tabled({name: name for name in ranking}, forced, note=windows),
+        "family/free-running": tabled(order, free, note=draws),
+    }
 
 
-def main(files: tyro.conf.Positional[tuple[Path, ...]], page: Path = DOCS / "results" / "family.md") -> None:
+def main(files: tyro.conf.Positional[tuple[Path, ...]], results: Path | None = None) -> None:
     """Write the tables.
 
     Args:
         files: what `dvae compare --out` wrote.
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
     """
-    write(page, *tables(reduce(dvae.Comparison.join, map(dvae.Comparison.load, files))))
+    write(results, tables(reduce(dvae.Comparison.join, map(dvae.Comparison.load, files))))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes the table of long forecasts of docs/results/hit_dvae.md, of a run fitted on poses."""
+"""Write a table of long forecasts of a run fitted on poses."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 import torch
 import tyro
 
-from .pages import DOCS, loaded, tabled, write
+from .results import Table, loaded, tabled, write
 
 
 @torch.no_grad()
-def long_run(path: Path, count: int, seconds: float) -> str:
+def long_run(path: Path, count: int, seconds: float) -> Table:
     """Bones and speed of forecasts that run on far past the horizon of training, second by second."""
     run = loaded(path)
     test = run.data.windows("test")
@@ -46,7 +46,7 @@ def long_run(path: Path, count: int, seconds: float) -> str:
 
 def main(
     run: tyro.conf.Positional[Path],
-    page: Path | None = DOCS / "results" / "hit_dvae.md",
+    results: Path | None = None,
     count: int = 200,
     seconds: float = 10.0,
 ) -> None:
@@ -54,11 +54,11 @@ def main(
 
     Args:
         run: a run directory.
-        page: page of the table; None prints it.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         count: number of windows to forecast.
         seconds: length of the forecasts.
     """
-    write(page, long_run(run, count, seconds), name="long forecasts")
+    write(results, {"hit_dvae/long-forecasts": long_run(run, count, seconds)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fit a linear SDE to utterances, whole and with half of their frames dropped, for docs/results/irregular.md.
+"""Fit a linear SDE to utterances, whole and with half of their frames dropped.
 
 Each run has a directory under `--runs`, with a file of scores for each scored part. An interrupted script continues and
 skips existing files. Options are chosen with `--part validation`, seed 0; `--part test` scores the runs of three seeds.
@@ -25,7 +25,7 @@ from dvae.networks.base import share_modules
 from dvae.tables.domains import domain
 
 from .engine import OURS, cell, measure, read
-from .pages import DOCS, table, write
+from .results import Table, write
 
 PARTICLES = 100
 KEPT = {"whole": 1.0, "halves": 0.5}
@@ -116,7 +116,7 @@ def apart(part: str) -> dict[str, float]:
     }
 
 
-def tables(runs: Path, part: str) -> str:
+def table(runs: Path, part: str, note: str) -> Table:
     """Return a table of the bounds on a part, and of the cost of dropping training frames."""
     found, free, lines = read(runs, KEPT, f"{part}.json"), apart(part), []
     for judged_on in KEPT:
@@ -130,12 +130,12 @@ def tables(runs: Path, part: str) -> str:
             lines.append([*line, *costs])
         lines.append([f"independent frames, tested on {judged_on}", f"{free[judged_on]:.3f}", "–", "–", "–"])
     header = [f"fitted on …, {part}", "nats a frame", "minus fitted on whole"]
-    return table([*header, "of its bound", "of its gain over independent frames"], lines)
+    return Table([*header, "of its bound", "of its gain over independent frames"], lines, note)
 
 
 def main(
     runs: Path = Path("runs/irregular"),
-    page: Path | None = DOCS / "results" / "irregular.md",
+    results: Path | None = None,
     part: Literal["validation", "test"] = "validation",
     seeds: tuple[int, ...] = (0,),
     latents: tuple[int, ...] = (8, 16),
@@ -144,7 +144,7 @@ def main(
 
     Args:
         runs: folder of the runs.
-        page: page of the table; None prints it.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         part: split to score and to show in the table.
         seeds: seeds of the runs to fit; empty to write the tables only.
         latents: sizes of the latent.
@@ -153,8 +153,8 @@ def main(
     for latent in latents:
         measure(runs / str(latent), KEPT, seeds, partial(run, latent, part), f"{part}.json")
     found = {latent: runs / str(latent) for latent in STEPS if (runs / str(latent)).exists()}
-    heads = {latent: f"Latent of {latent} numbers, {STEPS[latent]} steps:\n" for latent in found}
-    write(page, *(each for latent, own in found.items() for each in (heads[latent], tables(own, part))))
+    notes = {latent: f"Latent of {latent} numbers, {STEPS[latent]} steps." for latent in found}
+    write(results, {f"irregular/latent-{latent}": table(own, part, notes[latent]) for latent, own in found.items()})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fit and score the models of docs/results/mix_and_match.md, which differ in their noise, and write its tables.
+"""Fit and score models that differ in their noise, and write their tables.
 
 Each run has a directory under `--runs`, with measured.json. An interrupted script continues and skips existing files,
 and two processes may work on other seeds at once (`--seeds 0`, `--seeds 1 2`). Tables show the available files.
@@ -6,7 +6,6 @@ and two processes may work on other seeds at once (`--seeds 0`, `--seeds 1 2`). 
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.metric_models.quality import STILL, RealOrGenerated, quality
 
 from .engine import OURS, Row, budget, fitted, folder, measure, read, scores_of, settings, spread
-from .pages import DOCS, table, tabled, write
+from .results import DOCS, Table, tabled, write
 
 OPTIONS: dict[str, Any] = {"width": 128, "scale": 0.01}
 """Of all runs, chosen on the tuning protocol; others are those of the method."""
@@ -59,7 +58,7 @@ BODY = (
 
 @dataclass(frozen=True)
 class Section:
-    """Cases that the page compares with one another.
+    """Cases that are compared with one another.
 
     Args:
         protocol: name of the window protocol.
@@ -205,24 +204,25 @@ def heard(found: Mapping[str, Row]) -> dict[str, Row]:
     return {name: row for name, row in found.items() if row.name == OURS and row.runs[0]["codes"]["diversity"][-1] > 0}
 
 
-def angles(found: Mapping[str, Row]) -> str:
+def angles(found: Mapping[str, Row]) -> Table:
     """Ways and numbers of futures down, times across."""
     lines = []
     for name, row in found.items():
         for count in {"mix, velocity": COUNTS, STILL: (1,)}.get(name, (1, 50)):
             cells = [row.of("angles").said(f"{time:g} ms, best of {count}", 2) for time in TIMES]
             lines += [[name, str(count), *cells]] if "–" not in cells else []
-    return table(["", "best of", *(f"{time:g} ms" for time in TIMES)], lines)
+    return Table(["", "best of", *(f"{time:g} ms" for time in TIMES)], lines)
 
 
-def tables(name: str, found: Mapping[str, Row]) -> list[str]:
-    """Return a section's summary and tables."""
+def tables(name: str, found: Mapping[str, Row]) -> dict[str, Table]:
+    """Return a section's tables."""
     first = next(iter(found.values())).runs[0]
     clips, spent = first["futures"]["weights"], budget(found.values(), SECTIONS[name].steps)
-    done = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {spent}\n"
+    done = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {spent}"
     futures = {case: row.of("futures") for case, row in found.items()}
-    made = [tabled(futures, SCORED), tabled(heard(found), LISTENING)]
-    return [f"## {name}\n", done, *made, *([angles(found)] if "angles" in first else [])]
+    made = {"futures": tabled(futures, SCORED, note=done), "noise": tabled(heard(found), LISTENING)}
+    made |= {"angles": angles(found)} if "angles" in first else {}
+    return {f"mix_and_match/{folder(name)}-{what}": table for what, table in made.items()}
 
 
 def draw(found: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None:
@@ -265,7 +265,7 @@ def main(
     data: Path | None = None,
     raw: Path | None = None,
     runs: Path = Path("runs/mix-and-match"),
-    page: Path = DOCS / "results" / "mix_and_match.md",
+    results: Path | None = None,
     picture: Path = DOCS / "img" / "mix_and_match.png",
     sections: tuple[str, ...] = tuple(SECTIONS),
     cases: tuple[str, ...] = (),
@@ -277,9 +277,9 @@ def main(
         data: motion file with file groups (bandai2.npz); without it, its protocols are not fitted.
         raw: folder of CMU's BVH files; without it, its protocol is not fitted.
         runs: folder of the runs.
-        page: page of the tables.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         picture: figure of codes over training, and of quality against diversity.
-        sections: sections of the page to fit.
+        sections: sections to fit.
         cases: names of cases to fit; all cases of a section if empty.
         seeds: seeds of the runs to fit.
     """
@@ -293,7 +293,9 @@ def main(
         name: ({STILL: replace(rows["mix"], name=STILL)} if "mix" in rows else {}) | rows
         for name, rows in there.items()
     }
-    write(page, *itertools.chain(*(tables(name, rows) for name, rows in found.items() if rows)))
+    for name, rows in found.items():
+        if rows:
+            write(results, tables(name, rows))
     if found[TUNING]:
         draw(found[TUNING], found["alpha"], picture)
 

@@ -1,4 +1,4 @@
-"""Fit and score the latent spaces of gait cycles of docs/results/motion_latent_4d.md, and write its tables.
+"""Fit and score latent spaces of gait cycles, and write their tables.
 
 Each run has a directory under `--runs`, with measured.json. An interrupted script continues and skips existing files,
 and two processes may work on other cases or seeds at once. Tables and pictures show the available files.
@@ -6,7 +6,6 @@ and two processes may work on other cases or seeds at once. Tables and pictures 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
@@ -27,7 +26,7 @@ from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
 from .engine import OURS, Row, budget, fitted, folder, interval, measure, read, settings
-from .pages import DOCS, tabled, write
+from .results import DOCS, Table, tabled, write
 
 TUNING, HELD = "tuning", "held out"
 SAME, OTHER = "same source", "other source"
@@ -130,7 +129,7 @@ SCORED: dict[str, Callable[[Row], str]] = {
 INTERPOLATED = {name: partial(falling, name) for name in FALLS}
 
 
-def against(cases: Mapping[str, Row]) -> str:
+def against(cases: Mapping[str, Row]) -> Table:
     """Paired differences of vertex errors that should be below zero, with their intervals."""
     linear = next(name for name in cases if cases[name].name != OURS)
     pairs = ((FULL, FIRST), (FULL, linear), (FIRST, linear), (SHAPED, FULL))
@@ -142,16 +141,17 @@ def against(cases: Mapping[str, Row]) -> str:
     return tabled(found, {"vertex error (mm)": lambda each: f"{each.mean:.1f}", "95 %": interval})
 
 
-def tables(section: str, cases: Mapping[str, Row]) -> list[str]:
-    """Return a section's summary and two tables for each test set; interpolations are scored on the first only."""
-    first, parts = next(iter(cases.values())).runs[0], []
+def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
+    """Return a section's two tables for each test set; interpolations are scored on the first only."""
+    first, found = next(iter(cases.values())).runs[0], {}
     for test in first["tests"]:
         takes, own = first[test]["clips"], {name: row.of(test) for name, row in cases.items()}
         spent = budget(cases.values(), first["steps"])
-        done = f"{len(takes)} segments of {len({*takes})} takes. {spent}\n"
-        scored = tabled(own, SCORED | (INTERPOLATED if test == SAME else {}))
-        parts += [f"## {section.capitalize()}, {test}\n", done, scored, against(own)]
-    return parts
+        done = f"{len(takes)} segments of {len({*takes})} takes. {spent}"
+        name = f"motion_latent_4d/{folder(section)}-{folder(test)}"
+        found[name] = tabled(own, SCORED | (INTERPOLATED if test == SAME else {}), note=done)
+        found[f"{name}-differences"] = against(own)
+    return found
 
 
 def draw(held: Mapping[str, Row], tuned: Mapping[str, Row], file: Path) -> None:
@@ -187,7 +187,7 @@ def main(
     data: Path | None = None,
     other: Path | None = None,
     runs: Path = Path("runs/motion-latent"),
-    page: Path = DOCS / "results" / "motion_latent_4d.md",
+    results: Path | None = None,
     picture: Path = DOCS / "img" / "motion_latent_4d.png",
     sections: tuple[str, ...] = tuple(SECTIONS),
     cases: tuple[str, ...] = (),
@@ -200,7 +200,7 @@ def main(
         data: motion file with file groups (bandai2.npz); without it, nothing is fitted.
         other: motion file of a source outside the training data (cmu8.npz).
         runs: folder of the runs.
-        page: page of the tables.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         picture: figure of vertex errors, and of durations between walks and runs.
         sections: sections to fit.
         cases: names of cases to fit; all cases of a section if empty.
@@ -211,7 +211,9 @@ def main(
     for section in sections if data else ():
         measure(runs / folder(section), cases or SECTIONS[section], seeds, partial(run, section, data, other, steps))
     there = {name: rows_of(runs / folder(name), name) for name in SECTIONS}
-    write(page, *itertools.chain(*(tables(name, rows) for name, rows in there.items() if rows)))
+    for name, rows in there.items():
+        if rows:
+            write(results, tables(name, rows))
     draw(there[HELD], there[TUNING], picture)
 
 

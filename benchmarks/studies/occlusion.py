@@ -1,4 +1,4 @@
-"""Write the table of docs/results/occlusion.md, a comparison of methods and baselines that fill gaps in motion.
+"""Write tables of a comparison of methods and baselines that fill gaps in motion.
 
 Joints of the recordings are hidden in bursts (`dvae.motion.occlude`), in training and in test. Methods are fitted to
 the observed entries. They fill the gaps of whole test windows with means given latents of their guide.
@@ -22,7 +22,7 @@ from dvae.inference.evaluation.estimates import clustered_variance, linearised
 from dvae.inference.evaluation.evaluation_windows import clip_index
 from dvae.inference.evaluation.references import distances
 
-from .pages import DOCS, table, write
+from .results import Table, write
 
 METHODS: dict[str, dict[str, Any]] = {
     "srnn": {"residual": 0.9, "scheduled_sampling": 0.0},
@@ -99,7 +99,7 @@ def fitted(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
 
 def main(
     data: Path,
-    page: Path = DOCS / "results" / "occlusion.md",
+    results: Path | None = None,
     protocol: str = "bandai2-tuning",
     share: float = 0.2,
     length: float = 15.0,
@@ -112,7 +112,7 @@ def main(
 
     Args:
         data: motion file.
-        page: page of the table.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         protocol: name of the protocol that cuts and splits windows.
         share: hidden fraction of the joints.
         length: frames of a burst.
@@ -159,9 +159,10 @@ def main(
         average, spread = np.mean(found, 0), over([np.mean(spreads[name], 0)]) if name in spreads else ["–"]
         rows.append([name, *cells(average, weights), *spread, ", ".join(over(found)) if name in spreads else "–"])
         differences.append([name, *cells(average - made["straight line"][0], weights)])
-    said = f"{len(truth)} windows of {len(set(places))} clips, {int(weights[0].sum()):,} hidden joint positions.\n"
-    others = table(["minus straight line", *ranges], differences[1:])
-    write(page, said, table(["", *ranges, "spread", "seeds"], rows), others)
+    said = f"{len(truth)} windows of {len(set(places))} clips, {int(weights[0].sum()):,} hidden joint positions."
+    scores = Table(["", *ranges, "spread", "seeds"], rows, said)
+    others = Table(["minus straight line", *ranges], differences[1:])
+    write(results, {"occlusion/errors": scores, "occlusion/differences": others})
 
 
 if __name__ == "__main__":

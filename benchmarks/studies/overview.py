@@ -8,7 +8,7 @@ import torch
 import tyro
 from matplotlib.figure import Figure
 
-from .pages import DOCS
+from .results import DOCS
 
 
 def example(steps: int = 600) -> dict[str, Any]:

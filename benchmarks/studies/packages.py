@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-from .pages import DOCS
+from .results import DOCS
 
 ROOT = DOCS.parent / "dvae"
 EVERYWHERE = {"command", "files", "options", "locking", "lazy", "constants"}

@@ -26,7 +26,6 @@ from matplotlib.figure import Figure
 from dvae.inference.evaluation.result import new_figure
 
 from .engine import Row, cell, settings
-from .pages import DOCS, refuse_unknown, table, write
 from .ranking import (
     FUTURES,
     JOINTS,
@@ -42,6 +41,7 @@ from .ranking import (
     trained,
     work,
 )
+from .results import DOCS, Table, refuse_unknown, write
 
 
 def published() -> dict[str, dict[str, dict[str, str]]]:
@@ -62,7 +62,8 @@ class Further:
     """Views of some rows, with a table of their own.
 
     Args:
-        caption: caption of the table.
+        name: name of the table.
+        caption: note of the table.
         views: views of the rows.
         rows: names of the paper's rows.
         columns: scores of the table; empty for all columns of the paper.
@@ -70,6 +71,7 @@ class Further:
         apart: rows with a separate view, as row and view by label.
     """
 
+    name: str
     caption: str
     views: Sequence[View]
     rows: Sequence[str]
@@ -89,7 +91,7 @@ class Paper:
     Args:
         set: of `SETS`, on which rows are fitted.
         rows: to options of the method, as of `ranking.FUTURES`; the first is the paper's own.
-        columns: of each table of scores.
+        columns: of each table of scores, by its name.
         changes: rows, each with the one that it is compared with.
         compared: columns of the table of changes.
         printed: rows of the paper.
@@ -99,7 +101,7 @@ class Paper:
 
     set: str
     rows: Mapping[str, Mapping[str, Any]]
-    columns: Sequence[Sequence[str]]
+    columns: Mapping[str, Sequence[str]]
     changes: Sequence[tuple[str, str]]
     compared: Sequence[str]
     printed: Mapping[str, Mapping[str, str]]
@@ -132,7 +134,7 @@ PAPERS = {name: paper(name, told) for name, told in settings(__file__).items()}
 Found = Mapping[View, Mapping[str, Row]]
 
 
-def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[str, str]]) -> str:
+def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[str, str]], note: str = "") -> Table:
     """Return a table of rows in each view, followed by published rows; references use no given paths."""
     lines = []
     views = list(found)
@@ -148,10 +150,10 @@ def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[st
             continue
         name, _, given = row.rpartition(", ") if what else (row, "", "")
         lines.append([f"*{name}*", *([given] if what else []), "", "", *(cells.get(column, "–") for column in columns)])
-    return table(["", *([what] if what else []), *TRAINED, *columns], lines)
+    return Table(["", *([what] if what else []), *TRAINED, *columns], lines, note)
 
 
-def changes(found: Found, paper: Paper) -> str:
+def changes(found: Found, paper: Paper) -> Table:
     """Return a table of paired differences; columns are scores, or views if there are several."""
 
     def change(view: View, pair: tuple[str, str], column: str) -> str:
@@ -159,18 +161,19 @@ def changes(found: Found, paper: Paper) -> str:
         change = having.estimate(column, lacking) if having is not None and lacking is not None else None
         return "–" if change is None else str(change)
 
+    note = "What each change does, paired."
     pairs = [pair for pair in paper.changes if all(pair[0] in each for each in found.values())]
     if len(found) == 1:
         (view,) = found
         lines = [[*pair, *(change(view, pair, column) for column in paper.compared)] for pair in pairs]
-        return table(["", "minus", *paper.compared], lines)
+        return Table(["", "minus", *paper.compared], lines, note)
     lines = [
         [*pair, column, *(change(view, pair, column) for view in found)] for pair in pairs for column in paper.compared
     ]
-    return table(["", "minus", "", *(f"{view.given} given" for view in found)], lines)
+    return Table(["", "minus", "score", *(f"{view.given} given" for view in found)], lines, note)
 
 
-def more_joints(found: Found, paper: Paper) -> str:
+def more_joints(found: Found, paper: Paper) -> Table:
     """What each further path changes, paired."""
     views, lines = list(found), []
     for row in paper.rows:
@@ -180,7 +183,7 @@ def more_joints(found: Found, paper: Paper) -> str:
                 crossed = (more.crossed(column, fewer) for more, fewer in steps)
                 lines.append([row, column, *(cell(each and each.estimate()) for each in crossed)])
     header = [f"{JOINTS[view.given]} too" for view in views[:-1] if view.given is not None]
-    return table(["", "", *header], lines)
+    return Table(["", "score", *header], lines, "What each further path does, paired.")
 
 
 PATHED = ("ADE", "FDE", "energy score")
@@ -209,11 +212,6 @@ def drawn(found: Found, paper: Paper) -> Figure:
     return figure
 
 
-def captioned(caption: str, made: str) -> str:
-    """Return a table below its caption; empty if the table has no rows."""
-    return f"*{caption}:*\n\n{made}" if made.count("\n") > 2 else ""
-
-
 def main(
     runs: tyro.conf.Positional[Path],
     data: Path | None = None,
@@ -223,7 +221,7 @@ def main(
     samples: int = 50,
     stored: Path = SCORES,
     accelerator: Accelerator = "cpu",
-    pages: Path | None = None,
+    results: Path | None = None,
     pictures: Path = DOCS / "img",
 ) -> None:
     """Fit and score missing results, and write the tables.
@@ -237,8 +235,8 @@ def main(
         samples: number of futures of each window.
         stored: folder of scores and metric models.
         accelerator: device for training and forecasts, as in `benchmarks.studies.ranking`.
-        pages: folder of the pages; None prints the tables.
-        pictures: folder of the pictures, drawn only with the pages.
+        results: folder of the tables, such as benchmarks/results; None prints them.
+        pictures: folder of the pictures, drawn only with results.
     """
     refuse_unknown("paper", papers, PAPERS)
     refuse_unknown("row", rows, (row for name in papers for row in PAPERS[name].rows))
@@ -249,11 +247,11 @@ def main(
             views = {row: paper.views_of(row) for row in fitted}
             work(data, runs, stored, paper.set, fitted, views, seeds, samples, accelerator)
         found = {view: entries(stored, paper.set, view, paper.rows) for view in paper.views}
-        tables = [scores(found, columns, paper.printed) for columns in paper.columns]
-        tables.append(captioned("What each change does, paired", changes(found, paper)))
+        tables = {key: scores(found, columns, paper.printed) for key, columns in paper.columns.items()}
+        tables["changes"] = changes(found, paper)
         if len(found) > 1:
-            tables.append(captioned("What each further path does, paired", more_joints(found, paper)))
-            if pages is not None:
+            tables["further-paths"] = more_joints(found, paper)
+            if results is not None:
                 more = (view for each in paper.further for view in each.views if view == View(view.given))
                 seen = {view: entries(stored, paper.set, view, paper.rows) for view in more}
                 drawn(found | seen, paper).savefig(pictures / f"{name}.png", dpi=110)
@@ -262,9 +260,10 @@ def main(
             for called, (row, view) in each.apart.items():
                 if own := entries(stored, paper.set, view, [row]).get(row):
                     seen |= {view: seen.get(view, {}) | {called: own}}
-            for columns in ([each.columns] if each.columns else paper.columns) if seen else []:
-                tables.append(captioned(each.caption, scores(seen, columns, each.printed)))
-        write(None if pages is None else pages / f"{name.replace('-', '_')}.md", *filter(None, tables), name="rows")
+            for key, columns in ({"": each.columns} if each.columns else paper.columns).items() if seen else ():
+                tables[f"{each.name}-{key}".strip("-")] = scores(seen, columns, each.printed, each.caption)
+        folder = name.replace("-", "_")
+        write(results, {f"{folder}/{key}": table for key, table in tables.items() if table.rows})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fit SRNNs to some styles of bandai2, and write the tables of docs/calibration.md: bands on unseen styles.
+"""Fit SRNNs to some styles of bandai2, and write tables of prediction bands on unseen styles.
 
 A model is fitted to three of the five styles of groups A and B; the other two calibrate and test. The test group C is
 not used. Existing runs are not fitted again.
@@ -30,7 +30,7 @@ from dvae.inference.evaluation.references import References
 from dvae.inference.evaluation.scores import clip_means, over_horizon
 from dvae.motion.data.dataset import MotionData
 
-from .pages import DOCS, table, write
+from .results import Table, write
 
 STYLES = ("active", "elderly", "exhausted", "feminine", "youthful")
 SRNN = Training(steps=1500, batch_size=32, learning_rate=3e-3, decay=0.5, validate_every=500, progress=False)
@@ -107,15 +107,13 @@ def futures(
             yield forecasts_of("srnn", forecaster, SAMPLES, held, part), held.futures[part]
 
 
-def main(
-    runs: Path, data: Path, page: Path | None = DOCS / "calibration.md", models: int = 10, halves: int = 20
-) -> None:
+def main(runs: Path, data: Path, results: Path | None = None, models: int = 10, halves: int = 20) -> None:
     """Write the tables.
 
     Args:
         runs: folder of the runs.
         data: bandai2.npz.
-        page: page of the tables; None prints them.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         models: number of choices of training styles, at most ten; bandai2-tuning's comes first.
         halves: number of random halves of the clips for each choice.
     """
@@ -145,12 +143,13 @@ def main(
                 shares = [{region: scored.held(region, *split) for region in REGIONS} for split in splits]
                 found.setdefault(f"{name}, calibrated on {how}", []).extend(shares)
         if styles == TUNING:
-            first(page, model, opened, apart)
-    write(page, table(["", *COLUMNS], [row(name, each) for name, each in sorted(found.items())]), name="splits")
+            write(results, first(model, opened, apart))
+    splits = [row(name, each) for name, each in sorted(found.items())]
+    write(results, {"calibration/splits": Table(["", *COLUMNS], splits)})
 
 
-def first(page: Path | None, model: Any, opened: MotionData, apart: motion.Protocol) -> None:
-    """The table of one split in detail: calibrated on half of the clips of group B, judged on the other half."""
+def first(model: Any, opened: MotionData, apart: motion.Protocol) -> dict[str, Table]:
+    """Return the tables of one split: calibrated on half of the clips of group B, judged on the other half."""
     group = replace(apart, split_by="split", train=(), test=("calibration", "judged"))
     clips = [clip for clip in opened.motion if clip.labels["style"] in apart.test]
     kept = {clip.key for place, clip in enumerate(clips) if place % 2}
@@ -164,8 +163,7 @@ def first(page: Path | None, model: Any, opened: MotionData, apart: motion.Proto
         [region, *(str(judged[f"{what} 90 %, {region}"]) for what in ("said", "width said", "held", "width held"))]
         for region in REGIONS
     ]
-    header = ["held at once", "said", "width (m)", "conformal", "width (m)"]
-    write(page, table(header, lines), name="bands")
+    covered = Table(["held at once", "said", "width said (m)", "conformal", "width conformal (m)"], lines)
     scores = dvae.evaluate(
         model, halves[1], scores=over_horizon, samples=SAMPLES, draw_emission=True, references=False, progress=False
     )["model"]
@@ -174,7 +172,8 @@ def first(page: Path | None, model: Any, opened: MotionData, apart: motion.Proto
         [f"{level} %", *(str(scores[f"coverage {level} %, frame {frame}"]) for frame in frames)]
         for level in (50, 80, 90)
     ]
-    write(page, table(["coverage at frame", *map(str, frames)], lines), name="horizon")
+    horizon = Table(["coverage at frame", *map(str, frames)], lines)
+    return {"calibration/bands": covered, "calibration/horizon": horizon}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write the table of TrajeVAE's priors of docs/results/trajevae.md, with their fit to the posteriors.
+"""Write a table of TrajeVAE's priors with their fit to the posteriors.
 
 The table gives the root-mean-square distance of posterior draws of z from the prior's mean, in units of the prior's
 deviation. A value of 1 means that the prior is as wide as the posteriors. Below 1 the prior is too wide, above 1 too
@@ -22,8 +22,8 @@ from dvae import motion
 from dvae.models.motion.trajectories import FIRST, GIVEN
 from dvae.program.batch import CHUNK, rows
 
-from .pages import DOCS, loaded, table, write
 from .ranking import JOINTS
+from .results import Table, loaded, write
 from .tuning import evaluated, seen
 
 SCORES = ("APD", "energy score")
@@ -114,19 +114,19 @@ def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
 
 def main(
     runs: tyro.conf.Positional[tuple[Path, ...]],
-    page: Path | None = DOCS / "results" / "trajevae.md",
+    results: Path | None = None,
     counts: tuple[int, ...] = (0, 4),
 ) -> None:
     """Write the table.
 
     Args:
         runs: run directories of `benchmarks.studies.tuning`.
-        page: where; with None it is printed.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         counts: of joints whose paths are given.
     """
     widths = ["posterior means", "posterior", "prior means", "prior", "z in units of the prior"]
     header = ["", "given", *widths, *(f"{score}, {name}" for score in SCORES for name in DISTRIBUTIONS)]
-    write(page, table(header, [line for run in runs for line in lines(run, counts)]), name="priors")
+    write(results, {"trajevae/priors": Table(header, [line for run in runs for line in lines(run, counts)])})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Fit every method for motion on every set, score it on the test windows, and rank the methods.
 
-Options and training are the presets', chosen with the tuning protocol (docs/results/tuning.md). Runs are stored in
+Options and training are the presets', chosen with the tuning protocol (`benchmarks.studies.tuning`). Runs are stored in
 `RUNS/SET/METHOD-seedN`. Scores by clip, from which the tables are made, are stored in `SCORES/SET` with the metric
 models that computed them. An interrupted script therefore continues, also on another machine, and scores further
 methods with the same metric models. Without `--data` nothing is fitted.
@@ -36,7 +36,7 @@ from dvae.motion.geometry.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 
 from .engine import Archive, Row, cell, folder, settings, swept
-from .pages import DOCS, refuse_unknown, require_gpu, same, table, write
+from .results import DOCS, Table, refuse_unknown, require_gpu, same, write
 
 SCORES = Path(__file__).parents[1] / "scores"
 Accelerator = Literal["cpu", "cuda"]
@@ -432,10 +432,10 @@ def ranked(rows: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
     return dict(sorted(complete.items(), key=lambda item: item[1].mean))
 
 
-def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> str:
+def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> Table:
     """Return rows sorted by energy score, with differences to the neighbours and to the row above.
 
-    The model confidence set follows the table.
+    The note is the model confidence set.
     """
     scores = ranked(rows)
     header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
@@ -447,9 +447,9 @@ def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> str:
         lines.append([titled(name, row), *trained(row), *map(cell, [*behind, *map(row.estimate, columns)])])
     tested = {name: score for name, score in scores.items() if score.count >= ENOUGH}
     if not any(rows[name].trained for name in tested):
-        return table(header, lines)
+        return Table(header, lines)
     best = f"May be the best, at {100 * LEVEL:.0f} % over clips and seeds, of rows with {ENOUGH} seeds or more"
-    return f"{table(header, lines)}\n{best}: {', '.join(confidence_set(tested, level=LEVEL).members)}.\n"
+    return Table(header, lines, f"{best}: {', '.join(confidence_set(tested, level=LEVEL).members)}.")
 
 
 def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
@@ -483,7 +483,7 @@ def main(
     samples: int = 50,
     scores: Path = SCORES,
     accelerator: Accelerator = "cpu",
-    page: Path | None = None,
+    results: Path | None = None,
     picture: Path = DOCS / "img" / "ranking.png",
 ) -> None:
     """Fit and score missing results, and write the tables.
@@ -497,8 +497,8 @@ def main(
         samples: number of futures of each window.
         scores: folder of scores and metric models; an empty folder starts from the beginning.
         accelerator: on which to train and to forecast; runs on a GPU record no minutes.
-        page: page of the tables; None prints them.
-        picture: figure of all sets without given paths; drawn only with a page.
+        results: folder of the tables, such as benchmarks/results; None prints them.
+        picture: figure of all sets without given paths; drawn only with results.
     """
     refuse_unknown("set", sets, SETS)
     refuse_unknown("method", methods, {**FUTURES, **PATHS})
@@ -507,16 +507,14 @@ def main(
         if data is not None:
             named = {row: options for row, options in selected.methods.items() if not methods or row in methods}
             work(data, runs, scores, name, named, dict.fromkeys(named, selected.views), seeds, samples, accelerator)
-        tables = []
         for view in selected.views:
             if rows := rows_of(scores, name, view):
-                heading = "" if view.given is None else f"With {view.given} path{'s' * (view.given != 1)} given:\n\n"
-                tables.append(heading + ranking(rows, [*COLUMNS, *(JUDGED if selected.metric_models else ())]))
-        if tables:
-            write(page, *tables, name=name)
+                made = ranking(rows, [*COLUMNS, *(JUDGED if selected.metric_models else ())])
+                given = "" if view.given is None else f"-{view.given}-given"
+                write(results, {f"index/{name}{given}": made})
     sought = {name: rows_of(scores, name, View()) for name, selected in SETS.items() if View() in selected.views}
     futures = {name: rows for name, rows in sought.items() if rows}
-    if page is not None and futures:
+    if results is not None and futures:
         drawn(futures).savefig(picture, dpi=110)
 
 

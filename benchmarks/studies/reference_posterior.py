@@ -1,4 +1,4 @@
-"""Write the tables of docs/criticism.md on reference posteriors: guides of a surrogate, power, a neural model."""
+"""Write tables on reference posteriors: guides of a surrogate, power, a neural model."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ import tyro
 import dvae
 
 from . import bounds
-from .pages import DOCS, code, table, write
+from .results import Table, write
 
 LENGTH = 6
 """Steps of the sequences that neural models are fitted to."""
@@ -88,7 +88,7 @@ def neural(inference: str, x: torch.Tensor, fitting: int) -> dvae.DynamicalVAE:
 
 
 def main(
-    page: Path | None = DOCS / "criticism.md",
+    results: Path | None = None,
     steps: int = 8,
     sequences: int = 10,
     powers: int = 40,
@@ -98,7 +98,7 @@ def main(
     """Write the tables.
 
     Args:
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         steps: of a sequence of the surrogate.
         sequences: of the first table.
         powers: sequences of the table of power.
@@ -108,11 +108,11 @@ def main(
     rows = []
     for name, text in GUIDES.items():
         model, _ = bounds.fitted(text, steps, 300, scale=0.9)
-        rows.append([f"{code(text)}, {name}", *said(model, model.sample(sequences, steps)["x"])])
-    write(page, table(["best guide", *COLUMNS], rows), name="reference")
+        rows.append([f"`{text}`, {name}", *said(model, model.sample(sequences, steps)["x"])])
+    write(results, {"criticism/reference": Table(["best guide", *COLUMNS], rows)})
     guides = ["the posterior, 500 draws", "mean-field, 100 draws", "500 draws", "z_T too narrow, 500 draws"]
     head = ["T", *guides, f"{powers} of these together (p)"]
-    write(page, table(head, [power(each, powers) for each in (4, 16, 64, 256)]), name="power")
+    write(results, {"criticism/power": Table(head, [power(each, powers) for each in (4, 16, 64, 256)])})
     torch.manual_seed(1)
     phase, speed = 6.3 * torch.rand(400, 1), 0.3 + 0.4 * torch.rand(400, 1)
     angle = phase + speed * torch.arange(LENGTH)
@@ -126,8 +126,8 @@ def main(
         elapsed = process_time() - start
         bound = dvae.SequenceELBO(num_particles=20).terms(model, x[320:]).bound
         bound_text = f"{bound.mean():.2f} ± {bound.std() / len(bound) ** 0.5:.2f}"
-        rows.append([f"{code(GUIDES[name])}, {name}", bound_text, *cells, f"{elapsed:.0f} s"])
-    write(page, table(["fitted guide", "bound", "R-hat, draws", *COLUMNS, "CPU"], rows), name="fitted")
+        rows.append([f"`{GUIDES[name]}`, {name}", bound_text, *cells, f"{elapsed:.0f} s"])
+    write(results, {"criticism/fitted": Table(["fitted guide", "bound", "R-hat, draws", *COLUMNS, "CPU"], rows)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes the table of docs/rotations.md: how far joints are from where they were recorded, by their turns.
+"""Write a table of how far joints are from where they were recorded, by their rotations.
 
 Of every frame the turns are found, and joints are put back by them on bones of the rest pose.
 """
@@ -12,7 +12,7 @@ from torch import Tensor
 from dvae import motion
 from dvae.motion.geometry import kinematics, rotations
 
-from .pages import DOCS, table, write
+from .results import Table, write
 
 
 def errors(people: motion.MotionSet) -> Tensor:
@@ -27,19 +27,20 @@ def errors(people: motion.MotionSet) -> Tensor:
     return torch.cat(found)
 
 
-def main(data: Path, page: Path = DOCS / "rotations.md") -> None:
+def main(data: Path, results: Path | None = None) -> None:
     """Write the table.
 
     Args:
         data: motion file of positions, of one body.
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
     """
     people = motion.read_motion(data)
     found = 1000 * errors(people)
     columns = zip(people.skeleton.names, found.mean(0).tolist(), found.amax(0).tolist(), strict=True)
     rows = [[name, f"{mean:.2f}", f"{most:.2f}"] for name, mean, most in columns]
     whole = ["all", f"{found.mean():.2f}", f"{found.max():.2f}"]
-    write(page, f"{people.skeleton.name}, {len(found):,} frames.\n", table(["mm", "mean", "largest"], [*rows, whole]))
+    note = f"{people.skeleton.name}, {len(found):,} frames."
+    write(results, {"rotations/errors": Table(["mm", "mean", "largest"], [*rows, whole], note)})
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from dvae.inference.evaluation.evaluation_windows import clip_index, on_device_o
 from dvae.motion import Windows
 from dvae.program.batch import rows
 
-from .pages import DOCS, loaded, table, write
+from .results import Table, loaded, write
 
 DRAWS, PENALTY, CHUNK = 8, 1e-3, 128
 ONE_BODY = 0.01
@@ -151,7 +151,7 @@ def swaps(model: Any, windows: Windows, label: str, count: int, seed: int) -> li
 
 def main(
     runs: tyro.conf.Positional[tuple[Path, ...]],
-    page: Path | None = DOCS / "results" / "hit_dvae.md",
+    results: Path | None = None,
     labels: tuple[str, ...] = ("style", "content"),
     splits: tuple[str, ...] = ("train", "test"),
     count: int = 200,
@@ -161,7 +161,7 @@ def main(
 
     Args:
         runs: their directories.
-        page: where; with None they are printed.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         labels: what probes are to tell.
         splits: on whose windows; a probe is fitted on each anew.
         count: windows that are decoded with a latent of another.
@@ -175,10 +175,10 @@ def main(
             told += [[path.name, split, *line] for line in probes(run.model, windows, labels, seed)]
         windows = run.data.windows("test")
         swapped += [[path.name, *line] for line in swaps(run.model, windows, labels[0], count, seed)]
-    read = table(["", "windows", "probe of", *labels, "bone lengths, R²"], told)
+    read = Table(["", "windows", "probe of", *labels, "bone lengths, R²"], told)
     moved = ["mean pose moved, mm", "motion about it moved, mm", "mean pose from theirs, mm"]
     header = ["", "latent", "share of another's", *moved]
-    write(page, read, table(header, swapped), name="w")
+    write(results, {"hit_dvae/probes": read, "hit_dvae/exchanged-latents": Table(header, swapped)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write the table of docs/discrete.md: models with states that are summed out, on data with switching dynamics.
+"""Write a table of models with states that are summed out, on data with switching dynamics.
 
 Next to the bounds is the estimate of a bootstrap particle filter over states and latents of the fitted model, which
 uses neither its guide nor the sums.
@@ -17,7 +17,7 @@ from torch.nn.functional import one_hot
 import dvae
 from dvae.networks import Dense, Recurrent
 
-from .pages import DOCS, code, table, write
+from .results import Table, write
 
 CHAIN, LATENT = "p(k_t | k_{t-1})", "q(z_t | z_{t-1}, x_{1:T})"
 MODELS: dict[str, tuple[str, str, dict[str, int]]] = {
@@ -112,16 +112,16 @@ def row(
     few = x[:filtering]
     gap = dvae.iwae_bound(model, few, particles).bound / per - filtered(model, few, 10_000) / per
     cells = [f"{value.mean():.3f} ± {value.std() / len(value) ** 0.5:.3f}" for value in (elbo, weighted, gap)]
-    return [f"{name}, {code(generative)}", *cells, told(model, x, states)]
+    return [f"{name}, `{generative}`", *cells, told(model, x, states)]
 
 
 def main(
-    page: Path = DOCS / "discrete.md", steps: int = 50, fitting: int = 2000, particles: int = 64, filtering: int = 16
+    results: Path | None = None, steps: int = 50, fitting: int = 2000, particles: int = 64, filtering: int = 16
 ) -> None:
     """Write the table.
 
     Args:
-        page: where.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         steps: of a sequence.
         fitting: steps of training.
         particles: of the importance-weighted bound.
@@ -131,7 +131,8 @@ def main(
     train, _ = switching(1024, steps)
     test = switching(200, steps)
     header = ["model", "ELBO", f"IWAE, K = {particles}", "IWAE minus the filter's", "correct states"]
-    write(page, table(header, [row(name, train, test, fitting, particles, filtering) for name in MODELS]))
+    rows = [row(name, train, test, fitting, particles, filtering) for name in MODELS]
+    write(results, {"discrete/models": Table(header, rows)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes the table of exact paths of docs/results/trajevae.md: motions of a run along the paths of test windows."""
+"""Write a table of exact paths: motions of a run along the paths of test windows."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from dvae.inference.evaluation.estimates import TwoWayErrors
 from dvae.inference.evaluation.evaluation_windows import clip_index
 from dvae.models.motion.trajectories import Completion, TrajectoryModel
 
-from .pages import DOCS, loaded, table, write
 from .ranking import JOINTS
+from .results import Table, loaded, write
 
 METRICS = {
     "path error, m": ".3f",
@@ -36,7 +36,7 @@ def figures(made: Completion, true: np.ndarray) -> tuple[float, ...]:
     return off.mean(), (off < 0.01).mean(), bones.mean(), (bones < 0.1).mean(), moved
 
 
-def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -> str:
+def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -> Table:
     """By the number of given joints, and whether motions are to be exact; ± one standard error over clips."""
     run = loaded(folder)
     if not isinstance(run.model, TrajectoryModel):
@@ -67,12 +67,12 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
             for mean, form in zip(means, METRICS.values(), strict=True)
         ]
         rows.append([", ".join(joints[:number]), "exact" if exact else "", *told, f"{spent:.2f}"])
-    return table(["given", "", *METRICS, "seconds a motion"], rows)
+    return Table(["given", "exact", *METRICS, "seconds a motion"], rows)
 
 
 def main(
     run: tyro.conf.Positional[Path],
-    page: Path | None = DOCS / "results" / "trajevae.md",
+    results: Path | None = None,
     joints: tuple[str, ...] = JOINTS,
     count: int = 40,
     samples: int = 3,
@@ -81,13 +81,13 @@ def main(
 
     Args:
         run: a run directory.
-        page: page of the table; None prints it.
+        results: folder of the tables, such as benchmarks/results; None prints them.
         joints: joints with given paths, one more in each row.
         count: number of test windows, evenly spaced.
         samples: number of motions of each window.
     """
     torch.set_num_threads(1)
-    write(page, exact_paths(run, joints, count, samples), name="exact paths")
+    write(results, {"trajevae/exact-paths": exact_paths(run, joints, count, samples)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fit and score the options that are tuned for motion methods, and write the tables of docs/results/tuning.md.
+"""Fit and score the options that are tuned for motion methods, and write their tables.
 
 All runs use one protocol, bandai2-tuning. Training uses clips of group A. Tests use every fourth window of group B,
 whose styles differ from the training styles; no clip of the test group C is used. Scores are stored by section in
@@ -27,15 +27,15 @@ from dvae.motion.scoring.energies import pose_prior_energy
 from dvae.runs.directory import load
 
 from .engine import settings, swept
-from .pages import refuse_unknown, table, tabled, write
 from .ranking import JOINTS, METRIC_MODELS, SCORES, SETS, entries, fitted_metric_models, judging, parted
+from .results import Table, refuse_unknown, tabled, write
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
 EVERY, SAMPLES = 4, 50
 REFERENCES = ("zero velocity", "nearest neighbours")
 COLUMNS_OF_METRIC_MODELS = ("log density", "pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
-"""Scores that pages show, where there are."""
+"""Scores that tables show, where there are."""
 SEEDS, TESTED = "seeds", ("bandai2-by-style", "bandai2-trajectories")
 """The table of what another seed does, and the sets whose rows tell it."""
 PATH_COLUMNS = tuple(f"{score}, {count} given" for score in ("ADE", "APD", "energy score") for count in range(5))
@@ -197,7 +197,7 @@ def shown(name: str, scores: Sequence[Mapping[str, float]]) -> str:
     return f"{sum(values) / len(values):.3f}" + (f" ({each})" if len(values) > 1 else "")
 
 
-def spread() -> str:
+def spread() -> Table:
     """What another seed does to the energy score of methods with the steps of their presets, by their test windows.
 
     With paths to its mean over none to four. A difference of two runs has a standard deviation of sqrt(2) as much.
@@ -210,7 +210,7 @@ def spread() -> str:
             if (count := min(map(len, seeds), default=0)) > 1:
                 deviation = np.mean([means[:count] for means in seeds], 0).std(ddof=1)
                 lines.append([row, str(count), f"{deviation:.3f}", f"{2 * sqrt(2) * deviation:.2f}"])
-    return table(["", "seeds", "standard deviation", "decided from"], lines)
+    return Table(["", "seeds", "standard deviation", "decided from"], lines)
 
 
 def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
@@ -241,7 +241,7 @@ def main(
     sections: tuple[str, ...] = ("metric_models", SEEDS, *SECTIONS),
     jobs: int = 1,
     stored: Path = SCORES / "tuning.json",
-    page: Path | None = None,
+    results: Path | None = None,
 ) -> None:
     """Fit and score missing results, and write the tables.
 
@@ -251,14 +251,14 @@ def main(
         sections: names of sections.
         jobs: number of runs at a time.
         stored: the file of scores.
-        page: page of the tables; None prints them.
+        results: folder of the tables, such as benchmarks/results; None prints them.
     """
     refuse_unknown("section", sections, ("metric_models", SEEDS, *SECTIONS))
     tried = [name for name in sections if name != SEEDS]
     if data is not None:
         work(data, runs, stored, tried, jobs)
     if SEEDS in sections:
-        write(page, spread(), name=SEEDS)
+        write(results, {"tuning/seeds": spread()})
     known = Store(stored, "references").found
     for name in tried:
         columns, cases, beside = COLUMNS_OF_METRIC_MODELS, OF_METRIC_MODELS, {}
@@ -271,7 +271,8 @@ def main(
             row: [*seeds.values()] for row, seeds in {**beside, **{c: found.get(c) for c in cases}}.items() if seeds
         }
         head = name.replace("_", " ")
-        write(page, tabled(scored, {column: partial(shown, column) for column in columns}, head), name=name)
+        made = tabled(scored, {column: partial(shown, column) for column in columns}, head)
+        write(results, {f"tuning/{name}": made})
 
 
 if __name__ == "__main__":

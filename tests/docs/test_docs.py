@@ -13,7 +13,9 @@ from dvae.cli import app
 from dvae.cli import main as command
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted((ROOT / "docs").rglob("*.md"))
+MADE = ("project/changelog", "project/contributing", "reference/command_line", "results/appendix")  # with the site
+GENERATED = {ROOT / "docs" / f"{name}.md" for name in MADE}
+PAGES = sorted({*(ROOT / "docs").rglob("*.md")} - GENERATED)
 BLOCK = re.compile(r"(<!-- not run: [^\n]+ -->\n+)?^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 
@@ -70,7 +72,7 @@ def test_commands_parse(line, monkeypatch, tmp_path):
 def test_links_of_a_page_exist(page):
     for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
         linked = (page.parent / target).resolve()
-        assert linked.exists(), target
+        assert linked.exists() or linked in GENERATED, target
         assert linked.is_relative_to(ROOT / "docs"), f"{target} is not on the site"
 
 
@@ -115,4 +117,4 @@ def test_every_page_is_on_the_site():
     }
     pages = {str(page.relative_to(ROOT / "docs").with_suffix("")) for page in PAGES} - {"index"}
     notebooks = {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")}
-    assert entries == pages | notebooks
+    assert entries == pages | notebooks | {*MADE}

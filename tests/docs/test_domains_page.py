@@ -1,4 +1,4 @@
-"""The script of the domains page, on little data: it resumes, and its tables contain the finished runs."""
+"""The study of other data, on little data: it resumes, and its tables contain the finished runs."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.studies import domains, engine
+from benchmarks.studies import domains, engine, results
 from dvae import tables
 from dvae.inference.evaluation.estimates import TwoWayErrors
 from dvae.tables import Column, Columns, Panel, Series, reading
@@ -31,50 +31,49 @@ def panel():
 
 
 @pytest.fixture
-def page(tmp_path, monkeypatch):
+def out(tmp_path, monkeypatch):
     monkeypatch.setattr(torch, "set_num_threads", lambda number: None)  # the script sets one thread
     monkeypatch.setitem(tables.domains.DOMAINS, "tiny", tables.domains.DOMAINS["chorales"])
     monkeypatch.setattr(reading, "domain", lambda name: panel())
     section = domains.Section(CASES, SMALL, Cut(4, 2), unit="day", particles=5)
     monkeypatch.setattr(domains, "SECTIONS", {"tiny": section})
     monkeypatch.setattr(domains, "FORECASTS", 40)
-    path = tmp_path / "page.md"
-    path.write_text("Before.\n<!-- tables -->\n<!-- end of tables -->\nAfter.\n")
-    return path
+    return tmp_path / "results"
 
 
-def test_the_domains_page_contains_the_finished_runs(page, tmp_path, capsys):
+def test_the_tables_contain_the_finished_runs(out, tmp_path, capsys):
     runs = tmp_path / "runs"
-    domains.main(("tiny",), runs, page, "validation", seeds=(0, 1))
-    text = page.read_text()
-    for text_part in ("Before.\n", "### Tiny, validation", "2 sequences, 31 steps; 2 seeds", "nats a day"):
-        assert text_part in text
-    assert text.count("| dkf |") == 1
+    domains.main(("tiny",), runs, out, "validation", seeds=(0, 1))
+    bounds = results.read("domains/tiny-bounds", out)
+    assert bounds.note.startswith("Validation: 2 sequences, 31 steps; 2 seeds")
+    assert bounds.header[1].startswith("nats a day")
+    assert {row[0] for row in bounds.rows} == {"dkf", domains.BASELINE}
     modified = {path: path.stat().st_mtime_ns for path in runs.rglob("*")}
     capsys.readouterr()
-    domains.main(("tiny",), runs, page, "validation", seeds=(0, 1))
+    domains.main(("tiny",), runs, out, "validation", seeds=(0, 1))
     assert {path: path.stat().st_mtime_ns for path in runs.rglob("*")} == modified
-    assert page.read_text() == text
+    assert results.read("domains/tiny-bounds", out) == bounds
     assert not capsys.readouterr().out
     for case, has_references in (
         ("dkf", False),
         (domains.BASELINE, True),
     ):  # the file of the baseline has the references
-        domains.main(("tiny",), runs, page, "test", (case,))
-        assert "3 sequences, 54 steps; 1 seeds" in page.read_text()
-        assert page.read_text().count("| dkf |") == 2
-        assert ("climatology" in page.read_text()) == has_references
+        domains.main(("tiny",), runs, out, "test", (case,))
+        assert results.read("domains/tiny-bounds", out).note.startswith("Test: 3 sequences, 54 steps; 1 seeds")
+        names = {row[0] for row in results.read("domains/tiny-forecasts", out).rows}
+        assert "dkf" in names
+        assert ("climatology" in names) == has_references
 
 
-def test_bounds_are_per_step_with_standard_errors_over_sequences(page, tmp_path):
-    domains.main(("tiny",), tmp_path, page, "validation", (domains.BASELINE,), (0, 1))
+def test_bounds_are_per_step_with_standard_errors_over_sequences(out, tmp_path):
+    domains.main(("tiny",), tmp_path, out, "validation", (domains.BASELINE,), (0, 1))
     folders = [tmp_path / "tiny" / f"{domains.BASELINE}-{seed}" for seed in (0, 1)]
     stored = [json.loads((folder / "validation.json").read_text())["bounds"] for folder in folders]
     steps = np.array([15.0, 16.0])
     assert stored[0]["weights"] == steps.tolist()
     bounds = np.array([run_bounds["rows"][engine.OURS][domains.BOUND] for run_bounds in stored])
     expected = TwoWayErrors.of(bounds, steps).estimate()
-    results = engine.read(tmp_path / "tiny", [domains.BASELINE], "validation.json")[domains.BASELINE]
-    assert results.of("bounds").estimate(domains.BOUND) == expected
+    rows = engine.read(tmp_path / "tiny", [domains.BASELINE], "validation.json")[domains.BASELINE]
+    assert rows.of("bounds").estimate(domains.BOUND) == expected
     assert expected.mean == pytest.approx((bounds * steps).sum() / 62)
-    assert domains.said(results, "bounds", domains.BOUND) == str(expected)
+    assert domains.said(rows, "bounds", domains.BOUND) == str(expected)

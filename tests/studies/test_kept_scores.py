@@ -1,13 +1,13 @@
 """Scores that are kept are of what methods are today, and tell nothing of the machines that made them."""
 
 import json
-import re
 import zipfile
 
 import pytest
 
 import dvae
-from benchmarks.studies import engine, papers, ranking, tuning
+from benchmarks import bench
+from benchmarks.studies import engine, pairs, papers, ranking, results, tuning
 from dvae.models.motion.poses import PoseMethod
 from dvae.motion import WALKER
 
@@ -34,7 +34,7 @@ def test_scores_name_no_place(of):
         assert clips == len(told["clips"]), name
 
 
-@pytest.mark.parametrize("file", sorted(ranking.SCORES.rglob("metric models/*/config.json")), ids=named)
+@pytest.mark.parametrize("file", sorted(ranking.SCORES.rglob("metric_models/*/config.json")), ids=named)
 def test_judges_name_no_place(file):
     assert '"/' not in file.read_text(encoding="utf-8")
     assert (file.parent / "best.safetensors").stat().st_size < 2**20
@@ -70,21 +70,30 @@ def test_scores_are_of_the_presets(of, run):
         assert stored["training"][name] == now[name], name
 
 
+def test_tables_are_those_of_the_scores(tmp_path):
+    """All tables that studies make from stored scores."""
+    tuning.main(tmp_path, results=tmp_path)
+    papers.main(tmp_path, results=tmp_path, pictures=tmp_path)
+    ranking.main(tmp_path, results=tmp_path, picture=tmp_path / "ranking.png")
+    pairs.main(results=tmp_path)
+    bench.tabulate(json.loads(bench.HISTORY.read_text()), tmp_path)
+    made = [*tmp_path.glob("*/*.csv"), *tmp_path.glob("*/*.txt")]
+    assert {file.parent.name for file in made} == {"gsps", "hit_dvae", "index", "speed", "trajevae", "tuning"}
+    for file in made:
+        assert file.read_text() == (results.RESULTS / file.relative_to(tmp_path)).read_text(), file
+
+
 @pytest.mark.parametrize("name", ["metric_models", *tuning.SECTIONS])
-def test_what_was_tuned_stands_on_the_page(name):
+def test_what_was_tuned_is_in_a_table(name):
     """Every case that was scored, by the name that it has there."""
-    page = (ranking.SCORES.parents[1] / "docs" / "results" / "tuning.md").read_text(encoding="utf-8")
     found = tuning.Store(ranking.SCORES / "tuning.json", name).found
     assert found
     assert found.keys() <= set(tuning.OF_METRIC_MODELS if name == "metric_models" else tuning.SECTIONS[name].cases)
-    for case in found:
-        assert f"| {case} |" in page
+    assert found.keys() <= {row[0] for row in results.read(f"tuning/{name}").rows}
 
 
 def test_what_another_seed_does_is_that_of_the_rows_on_test_windows():
-    page = (ranking.SCORES.parents[1] / "docs" / "results" / "tuning.md").read_text(encoding="utf-8")
-    assert tuning.spread() in page
-    told = {row: float(deviation) for row, _, deviation, _ in map(cells, tuning.spread().splitlines()[2:])}
+    told = {row: float(deviation) for row, _, deviation, _ in tuning.spread().rows}
     rows = ranking.SETS["bandai2-by-style"].methods
     for row, entry in ranking.entries(ranking.SCORES, "bandai2-by-style", ranking.View(), rows).items():
         if row in rows:
@@ -92,20 +101,21 @@ def test_what_another_seed_does_is_that_of_the_rows_on_test_windows():
             assert told[row] == pytest.approx(error * len(entry.runs) ** 0.5, abs=6e-4)
 
 
-def cells(line):
-    return [cell.strip() for cell in line.strip("|").split("|")]
+@pytest.mark.parametrize("readme", sorted(results.RESULTS.glob("*/README.md")), ids=lambda file: file.parent.name)
+def test_every_table_can_be_read(readme):
+    """A folder has a short text; a table has one name for each column and as many cells in each row."""
+    text = readme.read_text(encoding="utf-8")
+    assert text.startswith("# ")
+    assert len(text.split()) <= 150
+    files = sorted(readme.parent.glob("*.csv"))
+    assert files
+    for file in files:
+        table = results.read(f"{readme.parent.name}/{file.stem}")
+        assert len({*table.header}) == len(table.header), file
+        assert table.rows, file
+        assert {len(row) for row in table.rows} == {len(table.header)}, file
 
 
-NUMBER = r"0?(\.\d+|\d+\.\d+) ± 0?(\.\d+) ± 0?(\.\d+)"
-
-
-@pytest.mark.parametrize("name", ["gsps", "hit_dvae", "trajevae"])
-def test_what_a_page_says_of_three_seeds_stands_in_its_tables(name):
-    """A mean with both errors; below the tables, where they are read."""
-    folder = ranking.SCORES.parents[1] / "docs" / "results"
-    lines = [line for page in ("index", name) for line in (folder / f"{page}.md").read_text("utf-8").splitlines()]
-    known = {found for line in lines if line.startswith("|") for found in re.findall(NUMBER, line)}
-    read = (folder / f"{name}.md").read_text("utf-8").split("<!-- end of rows -->")[1]
-    said = re.findall(NUMBER, " ".join(read.split()))
-    assert said
-    assert set(said) <= known
+def test_every_folder_of_tables_has_a_text():
+    folders = {path for path in results.RESULTS.iterdir() if path.is_dir()}
+    assert folders == {readme.parent for readme in results.RESULTS.glob("*/README.md")}

@@ -1,4 +1,4 @@
-"""What makes the tables of the pages, each on little: tables stand between the marks, and all else stays."""
+"""What makes the tables of results, each on little."""
 
 import json
 import re
@@ -30,10 +30,10 @@ from benchmarks.studies import (
     occlusion,
     overview,
     packages,
-    pages,
     papers,
     priors,
     ranking,
+    results,
     rotations,
     static,
     trajevae,
@@ -74,43 +74,29 @@ def _as_many_threads(monkeypatch):
 
 
 @pytest.fixture
-def page(tmp_path):
-    """A page with old tables between the marks."""
-    page = tmp_path / "page.md"
-    page.write_text(f"# Before\n{pages.BEGIN}\n| old |\n{pages.END}After\n", encoding="utf-8")
-    return page
+def out(tmp_path):
+    """A folder of tables."""
+    return tmp_path / "results"
 
 
-def tables(page):
-    """Return the tables of a page as lists of rows, and check that the text around them is unchanged."""
-    text = page.read_text(encoding="utf-8")
-    assert text.startswith(f"# Before\n{pages.BEGIN}\n")
-    assert text.endswith(f"\n{pages.END}After\n")
-    assert "old" not in text
-    found = []
-    for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
-        header, _, *rows = [re.split(r"(?<!\\)\|", line.strip())[1:-1] for line in block.splitlines()]
-        assert all(len(row) == len(header) for row in rows)
-        found.append([[cell.strip() for cell in row] for row in [header, *rows]])
-    return found
+def tables(out, *names):
+    """Return tables as lists of rows, with their headers."""
+    read = [results.read(name, out) for name in names]
+    assert all(len(row) == len(table.header) for table in read for row in table.rows)
+    return [[table.header, *table.rows] for table in read]
+
+
+def files(out):
+    """Return the texts of all tables and notes."""
+    return {file: file.read_text() for file in out.rglob("*.*")}
 
 
 @contextmanager
-def marked(page, name):
-    """The page with marks of another name, until its tables are read."""
-    for old, new in (("tables", name), (name, "tables")):
-        text = page.read_text()
-        page.write_text(text.replace(f"<!-- {old} -->", f"<!-- {new} -->").replace(f"of {old} -->", f"of {new} -->"))
-        if new == name:
-            yield
-
-
-@contextmanager
-def nothing_new(page, runs):
-    """A page and files that are as they were."""
+def nothing_new(out, runs):
+    """Tables and files that are as they were."""
 
     def found():
-        return page.read_text(), {file: file.stat().st_mtime_ns for file in runs.rglob("*.json")}
+        return files(out), {file: file.stat().st_mtime_ns for file in runs.rglob("*.json")}
 
     before = found()
     yield
@@ -122,48 +108,34 @@ def patched(monkeypatch, module, **values):
         monkeypatch.setattr(module, name, value)
 
 
-def test_audits(page, monkeypatch):
+def test_audits(out, monkeypatch):
     monkeypatch.setattr(audits, "FAMILY", {name: audits.FAMILY[name] for name in ("VAE", "DKF", "HiT-DVAE")})
-    marks = [mark.replace("tables", name) for name in ("derived", "edges") for mark in (pages.BEGIN, pages.END)]
-    page.write_text(page.read_text() + "".join(marks))
-    audits.main(page, steps=2, seeds=1)
-    before, derived = page.read_text().split(marks[0])
-    page.write_text(before)
-    guides = [line for line in derived.splitlines() if line.startswith("| DKF | `q(")]
-    assert len(guides) == len(alternatives(audits.FAMILY["DKF"][0]))
-    prices = [line for line in derived.splitlines() if line.startswith("| DKF | `") and " to z_t`" in line]
-    assert len(prices) == 3  # of z_{t-1}, x_t and x_{>t}
-    (table,) = tables(page)
-    prices = {row[0]: (row[3], float(row[5].split()[0])) for row in table[1:]}
+    audits.main(out, steps=2, seeds=1)
+    guides, derived, edges = tables(out, "audits/guides", "audits/derived", "audits/edges")
+    assert sum(row[0] == "DKF" for row in derived) == len(alternatives(audits.FAMILY["DKF"][0]))
+    assert sum(row[0] == "DKF" and row[1].endswith(" to z_t`") for row in edges) == 3  # of z_{t-1}, x_t and x_{>t}
+    prices = {row[0]: (row[3], float(row[5].split()[0])) for row in guides[1:]}
     assert [missing for missing, _ in prices.values()] == ["–", "–", "`z_{<t}`"]
     assert prices["VAE"][1] == prices["DKF"][1] == 0 < prices["HiT-DVAE"][1]
 
 
-def test_bounds(page, monkeypatch):
+def test_bounds(out, monkeypatch):
     monkeypatch.setattr(bounds, "TEMPERATURES", (2, 6))
-    begin, end = (mark.replace("tables", "sides") for mark in (pages.BEGIN, pages.END))
-    page.write_text(page.read_text() + begin + end)
-    bounds.main(page, steps=3, sequences=4, particles=2, fitting=20, sides=3)
-    before, sides = page.read_text().split(begin)
-    page.write_text(before)
-    rows = [line.split("|")[1:-1] for line in sides.splitlines() if line.startswith("| `")]
-    assert len(rows) == len(bounds.GUIDES)
-    assert all(abs(float(cell.split()[0])) < 1 for row in rows for cell in row[-2:])
-    (table,) = tables(page)
-    gaps = [float(row[1]) for row in table[1:]]
-    assert len(gaps) == len(bounds.GUIDES)
+    bounds.main(out, steps=3, sequences=4, particles=2, fitting=20, sides=3)
+    estimates, sides = tables(out, "bounds/estimates", "bounds/sides")
+    assert len(sides) == len(estimates) == len(bounds.GUIDES) + 1
+    assert all(abs(float(cell.split()[0])) < 1 for row in sides[1:] for cell in row[-2:])
+    gaps = [float(row[1]) for row in estimates[1:]]
     assert gaps[0] == max(gaps)
     assert min(gaps) >= 0
 
 
-def test_bracket(folder, page, tmp_path, monkeypatch):
+def test_bracket(folder, out, tmp_path, monkeypatch):
     monkeypatch.setattr(bracket, "SETTINGS", {"particles": 2, "temperatures": 2, "chains": 2})
     monkeypatch.setattr(bracket, "GUIDES", {name: bounds.GUIDES[name] for name in ("mean-field", "exact")})
-    marks = "".join(f"<!-- {name} -->\n<!-- end of {name} -->\n" for name in ("parts", "bracket"))
-    page.write_text(page.read_text().replace("| old |\n", marks))
     run = fitted(folder, "bracketed", "dkf", "--warm-up", 1, "--latent", 1)
-    bracket.main((run,), tmp_path / "kept", page, count=2, fitting=1, steps=2)
-    parts, (head, line) = tables(page)
+    bracket.main((run,), tmp_path / "kept", out, count=2, fitting=1, steps=2)
+    parts, (head, line) = tables(out, "bounds/parts", "bounds/runs")
     mean_field, exact = (float(row[1]) for row in parts[1:])
     assert mean_field > exact > -1e-6
     assert line[0].startswith("bracketed, ")
@@ -172,46 +144,44 @@ def test_bracket(folder, page, tmp_path, monkeypatch):
     (kept,) = (tmp_path / "kept").iterdir()
     kept.write_text(kept.read_text().replace('"seed"', '"other"'))
     with pytest.raises(ValueError, match="not written by Bracket"):
-        bracket.main((run,), tmp_path / "kept", page, count=2, fitting=1, steps=2)
+        bracket.main((run,), tmp_path / "kept", out, count=2, fitting=1, steps=2)
 
 
-def test_family(folder, page):
-    files = []
+def test_family(folder, out):
+    comparisons = []
     for name in ("vae", "dkf"):
-        run, out = fitted(folder, name, name, "--warm-up", 1), folder / f"{name}.json"
-        dvae("compare", run, "--particles", 2, "--samples", 2, "--out", out)
-        files.append(out)
-    family.main(tuple(files), page)
-    forced, free = tables(page)
+        run, file = fitted(folder, name, name, "--warm-up", 1), folder / f"{name}.json"
+        dvae("compare", run, "--particles", 2, "--samples", 2, "--out", file)
+        comparisons.append(file)
+    family.main(tuple(comparisons), out)
+    forced, free = tables(out, "family/teacher-forced", "family/free-running")
     assert {row[0] for row in forced[1:]} == {row[0] for row in free[1:]} == {"vae", "dkf"}
     assert forced[1][2] == "–"
 
 
-def test_bones(folder, page):
+def test_bones(folder, out):
     small = ("--pose-prior", "0", "--draws", "2")
     runs = tuple(fitted(folder, f"gsps-{bones}", "gsps", *small, f"--{bones}") for bones in ("no-bones", "bones"))
-    bones.main(runs, page, every=2, samples=2)
-    scores, differences = tables(page)
+    bones.main(runs, out, every=2, samples=2)
+    scores, differences = tables(out, "bones/scores", "bones/differences")
     lengths = {row[0]: float(row[1].split()[0]) for row in scores[1:]}
     assert lengths["gsps bones"] == 0 < 0.01 < lengths["gsps no bones"]
     assert [row[0] for row in differences[1:]] == ["gsps bones minus gsps no bones"]
     with pytest.raises(SystemExit, match="name each run without bones"):
-        bones.main(runs[1:], page)
+        bones.main(runs[1:], out)
 
 
-def test_hit_dvae(folder, page):
+def test_hit_dvae(folder, out):
     run = fitted(folder, "hit-dvae", "hit-dvae", "--pose-prior", "0")
-    with marked(page, "long forecasts"):
-        hit_dvae.main(run, page, count=2, seconds=2.0)
-    (seconds,) = tables(page)
+    hit_dvae.main(run, out, count=2, seconds=2.0)
+    (seconds,) = tables(out, "hit_dvae/long-forecasts")
     assert [row[0] for row in seconds[1:]] == ["1", "2"]
 
 
-def test_static(folder, page):
+def test_static(folder, out):
     run = fitted(folder, "with-w", "hit-dvae", "--pose-prior", "0", "--width", "8")
-    with marked(page, "w"):
-        static.main((run,), page, labels=("activity",), splits=("train",), count=5)
-    told, moved = tables(page)
+    static.main((run,), out, labels=("activity",), splits=("train",), count=5)
+    told, moved = tables(out, "hit_dvae/probes", "hit_dvae/exchanged-latents")
     assert [row[2] for row in told[1:]] == ["w", "z", "mean and spread of poses"]
     assert [row[1:3] for row in moved[1:]] == [*(["w", f"{share:g}"] for share in static.SHARES), ["z", "1"]]
     assert moved[1][3:5] == ["0", "0"]
@@ -238,7 +208,7 @@ def test_probes_tell_what_is_there_and_nothing_else():
     )
 
 
-def test_mix_and_match(tmp_path, page, monkeypatch):
+def test_mix_and_match(tmp_path, out, monkeypatch):
     """Fitted and scored once, whatever is asked again; two alphas make a curve."""
     monkeypatch.setattr(mix_and_match, "BODY", motion.WALKER.names)
     little = {"STEPS": 2, "EVERY": 20, "SAMPLES": 3, "WATCHED": 3, "FUTURES": 5, "THINNED": 2}
@@ -257,18 +227,16 @@ def test_mix_and_match(tmp_path, page, monkeypatch):
     options = {
         "raw": tmp_path / "bvh",
         "runs": tmp_path / "runs",
-        "page": page,
+        "results": out,
         "picture": tmp_path / "a.png",
     }
     mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
-    first, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
-    times = [file.stat().st_mtime_ns for file in files]
-    mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
-    assert page.read_text() == first
-    assert [file.stat().st_mtime_ns for file in files] == times
+    with nothing_new(out, tmp_path / "runs"):
+        mix_and_match.main(sections=tuple(sections), seeds=(0,), **options)
     (tmp_path / "runs" / mix_and_match.RAW / "mix-0" / engine.MEASURED).unlink()
     mix_and_match.main(sections=(mix_and_match.RAW,), cases=("mix",), seeds=(0, 1), **options)
-    ways, noise, angles, swept, _ = tables(page)
+    names = [f"{mix_and_match.RAW}-{what}" for what in ("futures", "noise", "angles")] + ["alpha-futures"]
+    ways, noise, angles, swept = tables(out, *(f"mix_and_match/{name}" for name in names))
     assert [row[0] for row in ways[1:]] == ["zero velocity", "mix", "mix, velocity", "no noise"]
     assert [row[0] for row in noise[1:]] == ["mix", "mix, velocity"]
     assert all(float(row[4].split()[0]) == 0 for row in ways[1:] if row[0] in ("zero velocity", "no noise"))
@@ -300,7 +268,7 @@ def short(monkeypatch):
     return completion.Budget(some=2, known=2, steps=2, dense=20)
 
 
-def test_motion_latent(tmp_path, page, monkeypatch):
+def test_motion_latent(tmp_path, out, monkeypatch):
     """Results are fitted and scored only once; an interrupted run continues; several seeds give errors."""
     people = motion.simulate(clips=12, frames=90, seed=1)
     told = [
@@ -314,20 +282,17 @@ def test_motion_latent(tmp_path, page, monkeypatch):
             options = {"widths": (8,), **case.get("method", {})}
             small = {**options, "latent": options.get("latent", 64) // 16}
             monkeypatch.setitem(cases, name, {**case, "method": small})
-    options = {"runs": tmp_path / "runs", "page": page, "picture": tmp_path / "a.png", "steps": 3}
+    options = {"runs": tmp_path / "runs", "results": out, "picture": tmp_path / "a.png", "steps": 3}
     data = {"data": tmp_path / "people.npz", "other": tmp_path / "people.npz"}
     main, tuning = motion_latent.main, ("both phases", "turns scaled", "z of 16")
     main(**data, sections=("held out",), cases=("both phases", "first phase alone"), seeds=(0, 1), **options)
     main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
-    text, files = page.read_text(), sorted((tmp_path / "runs").rglob("*.json"))
-    times = [file.stat().st_mtime_ns for file in files]
-    main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
-    assert page.read_text() == text
-    assert [file.stat().st_mtime_ns for file in files] == times
+    with nothing_new(out, tmp_path / "runs"):
+        main(**data, sections=("tuning",), cases=tuning, seeds=(0,), **options)
     (tmp_path / "runs" / "tuning" / "z-of-16-0" / engine.MEASURED).unlink()
     main(**data, sections=("tuning",), cases=("z of 16",), seeds=(0,), **options)
-    assert page.read_text().count("| z of 16 |") == 1
-    varied, _, same, against, other, _ = tables(page)
+    names = "tuning-same-source", "held-out-same-source", "held-out-same-source-differences", "held-out-other-source"
+    varied, same, against, other = tables(out, *(f"motion_latent_4d/{name}" for name in names))
     assert [row[0] for row in varied[1:]] == [*tuning, "PCA of 12", "PCA of 9"]
     assert [row[0] for row in same[1:]] == ["both phases", "first phase alone", "PCA of 12"]
     assert [row[0] for row in against[1:]][1] == "both phases minus PCA of 12"
@@ -335,24 +300,20 @@ def test_motion_latent(tmp_path, page, monkeypatch):
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
-def test_completion(tmp_path, page, short, monkeypatch):
+def test_completion(tmp_path, out, short, monkeypatch):
     """Results are measured only once; predictions exclude observed frames; no distance is below the floor."""
     small = method("motion-latent", latent=3, widths=(8,), finish=0.0)
     fit(small, dataset.SegmentData.open(), out=tmp_path / "a", **vars(Training(steps=2, batch_size=4, progress=False)))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
-    page.write_text(page.read_text().replace("tables -->", "completion -->"))
-    options = {"out": tmp_path / "out", "picture": tmp_path / "a.png", "budget": short, "page": page}
+    options = {"out": tmp_path / "out", "picture": tmp_path / "a.png", "budget": short, "results": out}
     runs = tmp_path / "a", tmp_path / "b"
     completion.main("simulated", runs, parts=("prediction",), **options)
     completion.main("simulated", runs[:1], parts=("completion", "uncertainty"), **options)
-    text, files = page.read_text(), sorted((tmp_path / "out").rglob("*.json"))
-    times = [file.stat().st_mtime_ns for file in files]
-    completion.main(None, runs, parts=("prediction",), **options)
-    completion.main(None, runs[:1], **options)
-    assert page.read_text() == text
-    assert [file.stat().st_mtime_ns for file in files] == times
-    page.write_text(text.replace("completion -->", "tables -->"))
-    curves, seen, *_, sure = tables(page)
+    with nothing_new(out, tmp_path / "out"):
+        completion.main(None, runs, parts=("prediction",), **options)
+        completion.main(None, runs[:1], **options)
+    names = "prediction", "completion-few", "completion-uncertainty"
+    curves, seen, sure = tables(out, *(f"motion_latent_4d/{name}" for name in names))
     assert [row[0] for row in curves[1:4]] == ["ours", "ours, body unknown", "reconstruction"]
     assert curves[-1][0] == "segments"
     assert [row[0] for row in seen[1:]][-2:] == ["10 points, 100 frames, markers", "0 points, 4 frames, markers"]
@@ -366,7 +327,7 @@ def test_completion(tmp_path, page, short, monkeypatch):
     assert (tmp_path / "a.png").stat().st_size > 10_000
     monkeypatch.setattr(completion, "TRIED", {"surface": (0.01,), "marker": (), "point": ()})
     monkeypatch.setattr(completion, "DESCENTS", [])
-    completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "page": None})
+    completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "results": None})
     assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2
     with pytest.raises(SystemExit, match="unknown part 'guesses'"):
         completion.main(parts=("guesses",), **options)
@@ -402,20 +363,19 @@ class MotionSpace:
         self.timed, self.body = data.timed, motion.bodies.human()
 
 
-def test_rotations(folder, page):
-    rotations.main(folder / "people.npz", page)
-    (table,) = tables(page)
+def test_rotations(folder, out):
+    rotations.main(folder / "people.npz", out)
+    (table,) = tables(out, "rotations/errors")
     assert [row[0] for row in table[1:]] == [*motion.WALKER.names, "all"]
     assert (
         float(table[1][2]) == 0 < max(float(row[2]) for row in table[1:]) == float(table[-1][2])
     )  # the root is as it was
 
 
-def test_trajevae(folder, page):
+def test_trajevae(folder, out):
     run = fitted(folder, "trajevae", "trajevae", "--protocol", "simulated-trajectories")
-    with marked(page, "exact paths"):
-        trajevae.main(run, page, joints=("RFoot", "LWrist"), count=2, samples=2)
-    ((header, *rows),) = tables(page)
+    trajevae.main(run, out, joints=("RFoot", "LWrist"), count=2, samples=2)
+    ((header, *rows),) = tables(out, "trajevae/exact-paths")
     assert [row[:2] for row in rows] == [[given, how] for given in ("RFoot", "RFoot, LWrist") for how in ("", "exact")]
 
     def number(row, name):
@@ -435,16 +395,15 @@ def test_trajevae(folder, page):
         trajevae.main(folder / "nowhere")
 
 
-def test_priors(folder, page, monkeypatch):
+def test_priors(folder, out, monkeypatch):
     monkeypatch.setattr(tuning, "SAMPLES", 4)
     small = ["--protocol", "simulated-trajectories", "--width", "8", "--latent", "4"]
     runs = [
         fitted(folder, name, "trajevae", *small, *options)
         for name, options in {"learned": (), "standard": ("--no-learned-prior", "--no-cosine")}.items()
     ]
-    with marked(page, "priors"):
-        priors.main(tuple(runs), page, counts=(0,))
-    ((header, *rows),) = tables(page)
+    priors.main(tuple(runs), out, counts=(0,))
+    ((header, *rows),) = tables(out, "trajevae/priors")
     assert [row[:2] for row in rows] == [[run.name, "0"] for run in runs]
 
     def column(name):
@@ -485,28 +444,27 @@ def test_what_a_prior_has_in_common_are_the_moments_of_the_posteriors_together()
             assert (values[:, 3] == before[:, 3]).all()
 
 
-def test_occlusion(folder, page, monkeypatch):
+def test_occlusion(folder, out, monkeypatch):
     monkeypatch.setattr(occlusion, "STEPS", {"srnn": 2})
     monkeypatch.setattr(occlusion, "METHODS", {"srnn": {"latent": 2, "width": 4}})
-    occlusion.main(folder / "people.npz", page, "simulated", length=8.0, stride=75, seeds=2, samples=2)
-    errors, differences = tables(page)
+    occlusion.main(folder / "people.npz", out, "simulated", length=8.0, stride=75, seeds=2, samples=2)
+    errors, differences = tables(out, "occlusion/errors", "occlusion/differences")
     assert [row[0] for row in errors[1:]] == ["straight line", f"{occlusion.NEIGHBOURS} neighbours", "srnn"]
     assert all(float(cell.split()[0]) > 0 for row in errors[1:] for cell in row[1:3])
     error, line, more = (float(row[1].split()[0]) for row in (errors[3], errors[1], differences[2]))
     assert abs(error - line - more) < 0.11  # of three rounded numbers
 
 
-def test_ranking(folder, page, monkeypatch):
+def test_ranking(folder, out, monkeypatch):
     """Results are fitted and scored only once; differences are between rows; later runs are added."""
     methods = {"cvae": {"width": 4, "latent": 2}, "srnn": {"width": 4, "latent": 2, "warm_up": 1}}
     small = {name: {**options, "steps": 2, "batch_size": 4} for name, options in methods.items()}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", small)})
     monkeypatch.setattr(ranking, "fitted_metric_models", lambda *arguments: {})
     monkeypatch.setattr(ranking, "ENOUGH", 2)
-    page.write_text(page.read_text().replace("tables", "simulated"))
     runs, scores = folder / "ranked", folder / "scores"
     picture = folder / "ranking.png"
-    options = {"scores": scores, "page": page, "picture": picture, "samples": 2, "sets": ("simulated",)}
+    options = {"scores": scores, "results": out, "picture": picture, "samples": 2, "sets": ("simulated",)}
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SystemExit, match=r"finds no GPU.*; leave the accelerator out"):
         ranking.main(runs, folder, accelerator="cuda", **options)
@@ -520,10 +478,11 @@ def test_ranking(folder, page, monkeypatch):
     assert not runs.exists()
     ranking.main(runs, **options)
     assert before == archive.file.stat().st_mtime_ns
-    page.write_text(page.read_text().replace("simulated", "tables"))
-    (best,) = re.findall(r"^May be the best, .* with 2 seeds or more: (.*)\.$", page.read_text(), re.MULTILINE)
+    (best,) = re.findall(
+        r"^May be the best, .* with 2 seeds or more: (.*)\.$", results.read("index/simulated", out).note
+    )
     assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # of the other there is one seed
-    (rows,) = tables(page)
+    (rows,) = tables(out, "index/simulated")
     by_name = {row[0]: row for row in rows[1:]}
     assert by_name.keys() == {"zero velocity", "nearest neighbours", *methods}
     assert (by_name["cvae"][1], by_name["srnn"][1]) == ("1", "2")
@@ -533,15 +492,14 @@ def test_ranking(folder, page, monkeypatch):
         assert abs(float(row[4].split()[0]) - (energy - before)) < 0.0016  # of three rounded numbers
 
 
-@pytest.mark.parametrize("text", ["", "{begin}", "{end}{begin}"])
-def test_a_page_without_both_marks_is_left_as_it_is(tmp_path, text):
-    page = tmp_path / "page.md"
-    with pytest.raises(SystemExit, match=r"no page .*page\.md"):
-        pages.write(page, "a table")
-    page.write_text(text.format(begin=pages.BEGIN, end=pages.END))
-    with pytest.raises(SystemExit, match=r"no marks .*<!-- tables --> and <!-- end of tables -->"):
-        pages.write(page, "a table")
-    assert page.read_text() == text.format(begin=pages.BEGIN, end=pages.END)
+def test_a_table_is_read_as_it_was_written(out, capsys):
+    table = results.Table(["", "a, b"], [["`p(z | x)`", 'the "first" ± 1'], ["ä", ""]], "A note.")
+    results.write(out, {"some/table": table})
+    assert results.read("some/table", out) == table
+    results.write(out, {"some/table": table._replace(note="")})
+    assert results.read("some/table", out).note == ""
+    results.write(None, {"some/table": table})
+    assert "A note.\n\n|  | a, b |\n| --- | ---: |\n| `p(z \\| x)` |" in capsys.readouterr().out
 
 
 def test_minutes_are_told_of_processors():
@@ -663,31 +621,32 @@ def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, 
     assert once == again
 
 
-def test_papers(folder, page, monkeypatch):
+def test_papers(folder, out, monkeypatch):
     """Rows appear in their views; a change is the difference of its rows; published cells stay."""
     small = {"latent": 2, "width": 4, "feedforward": 4, "steps": 2, "batch_size": 4}
     paper = papers.Paper(
         "simulated-trajectories",
         {"trajevae": small, "whole poses": {**small, "method": "trajevae", "complement": False}},
-        (("APD", "ADE"),),
+        {"scores": ("APD", "ADE")},
         [("trajevae", "whole poses")],
         ("ADE",),
         {"Human3.6M: TrajeVAE, 0": {"APD": "8.462", "ADE": ".518"}},
         (ranking.View(0), ranking.View(1)),
         [
-            papers.Further("One motion", [ranking.View(1, single=True)], ["trajevae"]),
-            papers.Further("Another", [ranking.View(1, exchanged=9.0)], []),
+            papers.Further("one-motion", "One motion.", [ranking.View(1, single=True)], ["trajevae"]),
+            papers.Further("another", "Another.", [ranking.View(1, exchanged=9.0)], []),
         ],
     )
     monkeypatch.setattr(papers, "PAPERS", {"page": paper})
     monkeypatch.setattr(ranking, "SETS", {paper.set: ranking.Set("people.npz", {})})
     monkeypatch.setattr(ranking, "JOINTS", ("RFoot",))
     monkeypatch.setattr(papers, "JOINTS", ("RFoot",))
-    where = {"stored": folder / "scores", "pages": page.parent, "pictures": page.parent}
-    with marked(page, "rows"):
-        for data in (folder, None):
-            papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **where)
-    rows, compared, more, single = tables(page)
+    where = {"stored": folder / "scores", "results": out, "pictures": folder}
+    for data in (folder, None):
+        papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **where)
+    names = ("scores", "changes", "further-paths", "one-motion-scores")
+    assert {file.stem for file in (out / "page").glob("*.csv")} == {*names}
+    rows, compared, more, single = tables(out, *(f"page/{name}" for name in names))
     named = {(row[0], row[1]): row[2:] for row in rows[1:]}
     runs = {(name, count) for name in paper.rows for count in "01"}
     assert named.keys() == {("zero velocity", ""), ("nearest neighbours", ""), ("*Human3.6M: TrajeVAE*", "0"), *runs}
@@ -695,11 +654,11 @@ def test_papers(folder, page, monkeypatch):
     ades = {key: float(named[key][3].split()[0]) for key in runs}
     for count, change in zip("01", compared[1][3:], strict=True):
         assert abs(float(change.split()[0]) - (ades["trajevae", count] - ades["whole poses", count])) < 0.0016
-    assert more[0][2:] == ["RFoot too"]
+    assert more[0][1:] == ["score", "RFoot too"]
     assert float(more[1][2].split()[0]) == pytest.approx(ades["trajevae", "1"] - ades["trajevae", "0"], abs=0.0016)
     assert [row[:2] for row in single[1:]] == [["trajevae", "1"]]
     assert single[1][4].startswith("0.000")  # one motion has no diversity
-    assert (page.parent / "page.png").stat().st_size > 0
+    assert (folder / "page.png").stat().st_size > 0
     found = {view: ranking.entries(folder / "scores", paper.set, view, paper.rows) for view in paper.views}
     errors, *_ = papers.drawn(found, paper).axes
     for row, line in zip(paper.rows, (line for line in errors.lines if line.get_marker() == "o"), strict=True):
@@ -707,7 +666,7 @@ def test_papers(folder, page, monkeypatch):
         assert line.get_ydata() == pytest.approx([ades[row, count] for count in "01"], abs=0.0006)
 
 
-def test_tuning(folder, page, monkeypatch):
+def test_tuning(folder, out, monkeypatch):
     """Cases of one method, and of another with paths; scored once."""
     training = Training(steps=2, batch_size=4)
     cases = {"preset": {}, "wide, longer": {"width": 6, "steps": 3}}
@@ -719,18 +678,15 @@ def test_tuning(folder, page, monkeypatch):
     usual = motion.PROTOCOLS["simulated"]
     patched(monkeypatch, tuning, SECTIONS=sections, TUNING=usual, JOINTS=(), SAMPLES=2)
     monkeypatch.setattr(tuning, "fitted_metric_models", lambda *arguments: {})
-    for name in sections:
-        page.write_text(
-            "\n".join([page.read_text(), *(mark.replace("tables", name) for mark in (pages.BEGIN, pages.END))])
-        )
     for data in (folder / "people.npz", None):
-        tuning.main(folder / "tuned", data, tuple(sections), stored=folder / "tuning", page=page)
-        rows = re.findall(r"^\| (preset|wide, longer) \| (.*) \|$", page.read_text(), re.MULTILINE)
-        assert [name for name, _ in rows] == ["preset", "wide, longer", "preset"]
-        assert re.match(r"[\d.]+ \([\d.]+, [\d.]+\)", rows[0][1])
-        assert rows[0][1] != rows[1][1]
-        for reference in tuning.REFERENCES:
-            assert len(re.findall(rf"^\| {reference} \| \d\.\d+ \|", page.read_text(), re.MULTILINE)) == 2
+        tuning.main(folder / "tuned", data, tuple(sections), stored=folder / "tuning", results=out)
+        futures, paths = (
+            {row[0]: row[1:] for row in table[1:]} for table in tables(out, "tuning/cvae", "tuning/cvae-rnn")
+        )
+        assert futures.keys() == {*tuning.REFERENCES, *cases}
+        assert paths.keys() == {*tuning.REFERENCES, "preset"}
+        assert re.match(r"[\d.]+ \([\d.]+, [\d.]+\)", futures["preset"][0])
+        assert futures["preset"] != futures["wide, longer"]
         assert tuning.Store(folder / "tuning", "cvae").found.keys() == cases.keys()
         shutil.rmtree(folder / "tuned", ignore_errors=True)  # scored, which is enough
     failing = {"without a prior": {"method": "gsps", "pose_prior_run": "nowhere"}}
@@ -739,7 +695,7 @@ def test_tuning(folder, page, monkeypatch):
         tuning.main(folder / "tuned", folder / "people.npz", ("cvae",), stored=folder / "tuning")
 
 
-def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, page, monkeypatch):
+def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, out, monkeypatch):
     """Which has the determinant that the score of futures leaves out."""
     protocol = motion.PROTOCOLS["simulated"]
     training = Training(2, 4, learning_rate=0.01, progress=False)
@@ -753,9 +709,8 @@ def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, page, monkeypa
         SEEDS_OF={"prior": (0, 1)},
         METRIC_MODELS={"prior": ("pose-prior", {}, training)},
     )
-    with marked(page, "metric_models"):
-        tuning.main(tmp_path, folder / "people.npz", ("metric_models",), stored=tmp_path / "scores", page=page)
-    (rows,) = tables(page)
+    tuning.main(tmp_path, folder / "people.npz", ("metric_models",), stored=tmp_path / "scores", results=out)
+    (rows,) = tables(out, "tuning/metric_models")
     assert [row[-1] for row in rows[1:]] == ["–", "–"]
     found = tuning.Store(tmp_path / "scores", "metric_models").found
     assert all(seeds.keys() == {"0", "1"} for seeds in found.values())
@@ -773,7 +728,7 @@ def test_gsps_has_the_prior_of_its_judge_where_it_sees_poses_as_the_judge_does(t
     assert told == {"6500 steps": str(tmp_path), "not turned": ""}
 
 
-def test_irregular(tmp_path, page, monkeypatch):
+def test_irregular(tmp_path, out, monkeypatch):
     """Fitted and scored once, whatever is asked again; runs are judged on the same halves of the same sequences."""
     random = np.random.default_rng(0)
     parts = ["train", "validation", "test"] * 4
@@ -782,11 +737,11 @@ def test_irregular(tmp_path, page, monkeypatch):
     training, size = {"batch_size": 3, "validate_every": 2}, {"width": 4, "decoder": ()}
     monkeypatch.setattr(irregular, "domain", lambda name: panel)
     patched(monkeypatch, irregular, STEPS={2: 2}, SIZE=size, TRAINING=training, PARTICLES=3)
-    options = {"runs": tmp_path / "runs", "page": page, "seeds": (0, 1), "latents": (2,)}
+    options = {"runs": tmp_path / "runs", "results": out, "seeds": (0, 1), "latents": (2,)}
     irregular.main(part="test", **options)
-    with nothing_new(page, tmp_path / "runs"):
+    with nothing_new(out, tmp_path / "runs"):
         irregular.main(part="test", **options)
-    (found,) = tables(page)
+    (found,) = tables(out, "irregular/latent-2")
     rows = {row[0]: row[1:] for row in found[1:]}
     for kept in irregular.KEPT:
         whole, halves, less = (
@@ -818,9 +773,8 @@ def test_gaps_are_as_long_as_they_are():
 @pytest.fixture
 def benches(tmp_path, monkeypatch, capsys):
     """Run benchmarks with given rows, one tuple for each measurement; return the status and the last line."""
-    (tmp_path / "speed.md").write_text("<!-- history -->\n<!-- end of history -->\n")
     monkeypatch.setattr(bench, "HISTORY", tmp_path / "history.json")
-    monkeypatch.setattr(bench, "page", partial(bench.page, path=tmp_path / "speed.md"))
+    monkeypatch.setattr(bench, "tabulate", partial(bench.tabulate, results=tmp_path))
     monkeypatch.setattr(bench, "there", lambda *_: {})
 
     def run(*found, targets=BENCHES, commit="b", version="1.0", keep=False):
@@ -832,7 +786,8 @@ def benches(tmp_path, monkeypatch, capsys):
         assert not left
         return status, capsys.readouterr().out.splitlines()[-1].strip()
 
-    run.page, run.history = tmp_path / "speed.md", tmp_path / "history.json"
+    run.row = lambda name: {row[0]: row[1:] for row in results.read("speed/history", tmp_path).rows}[name]
+    run.history = tmp_path / "history.json"
     return run
 
 
@@ -885,7 +840,7 @@ def test_a_slower_row_is_measured_beside_the_code_of_the_release(benches, monkey
 def test_a_release_is_the_first_record_of_its_version(benches):
     benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
     benches((1.05, 5.0, 7.0, 0.01), keep=True)
-    assert "| speed: gain | at least 3 | **5.00** | 4.00 | 1.25 |" in benches.page.read_text()
+    assert benches.row("speed: gain") == ["at least 3", "yes", "5.00", "4.00", "1.25"]
     fewer = {"speed: step": BENCHES["speed: step"], "speed: other": ("at most", None)}
     benches((1.08, 3.0), targets=fewer, keep=True)
     first, second = json.loads(benches.history.read_text())
@@ -894,7 +849,7 @@ def test_a_release_is_the_first_record_of_its_version(benches):
     assert benches((1.12, 5.0, 7.0, 0.01), (1.12, 5.0, 7.0, 0.01), commit="c")[0] == 1  # though not of the second
     benches((1.1, 5.0, 7.0, 0.01), commit="d", version="2.0", keep=True)
     assert benches((1.2, 5.0, 7.0, 0.01), commit="e", version="2.0")[0] == 0
-    assert "| speed: step | at most 2 | **1.10** | 1.08 | 1.00 | 1.10 |" in benches.page.read_text()
+    assert benches.row("speed: step") == ["at most 2", "yes", "1.10", "1.00", "1.10"]
 
 
 def test_a_release_is_measured_by_its_own_code(tmp_path, monkeypatch):
