@@ -137,9 +137,13 @@ def _shorten_sidebar(_app: object, _page: str, _template: str, context: dict[str
 
 
 def _adapt_links(_app: object, page: str, source: list[str]) -> None:
-    """Adapt the links of notebooks to their copies."""
+    """Adapt links from and to notebooks to their copies."""
     if page.startswith("notebooks/"):
         source[0] = source[0].replace("](../docs/", "](../")
+    else:
+        source[0] = (
+            source[0].replace("](../notebooks/", "](notebooks/").replace("](../../notebooks/", "](../notebooks/")
+        )
 
 
 class LinkNames(SphinxTransform):

@@ -2,7 +2,6 @@
 
 import doctest
 import re
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,6 +13,7 @@ import dvae.factorization.graph
 import dvae.factorization.inversion
 import dvae.factorization.notation
 from benchmarks.studies.audits import FAMILY
+from benchmarks.studies.results import read
 from dvae.factorization.graph import analytic_kl, audit
 from dvae.factorization.notation import Factorization
 from dvae.testing.strategies import factorizations
@@ -30,7 +30,7 @@ PUBLISHED = {
     "storn original": (STORN, "q(z_t | x_{<t})", {"z": ("x_{>=t}", "z_{<t}")}, {"z": ("x_{<t}",)}),
     "long lag": ("p(z_t | z_{t-25:t-1}) p(x_t | z_t)", "q(z_t | z_{t-9:t-1}, x_{>=t})", {"z": ("z_{t-25:t-10}",)}, {}),
 }
-"""Guides that docs/audits.md does not list."""
+"""Guides that the stored table of audits does not list."""
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -126,22 +126,16 @@ def test_examples_in_docstrings_run(module):
 
 
 def documented():
-    """Return name -> (generative, inference, missing, redundant) of the table in docs/audits.md, as lists of terms."""
-    page = Path(__file__).parents[2] / "docs" / "audits.md"
-    first = page.read_text(encoding="utf-8").partition("<!-- end of tables -->")[0]
-    lines = [line for line in first.splitlines() if line.startswith("| ")]
-    rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[1:]]
-    return {
-        name: [[term.replace(r"\|", "|") for term in re.findall("`(.*?)`", cell)] for cell in cells]
-        for name, *cells, _ in rows
-    }
+    """Return name -> (generative, inference, missing, redundant) of the stored table of audits, as lists of terms."""
+    rows = read("audits/guides").rows
+    return {name: [re.findall("`(.*?)`", cell) for cell in cells] for name, *cells, _ in rows}
 
 
 DOCUMENTED = documented()
 
 
 @pytest.mark.parametrize("name", DOCUMENTED)
-def test_the_audits_page_agrees_with_audit(name):
+def test_the_stored_table_of_audits_agrees_with_audit(name):
     (generative,), (inference,), missing, redundant = DOCUMENTED[name]
     result = audit(generative, inference)
     assert missing == [term for terms in result.missing.values() for term in terms]
