@@ -163,9 +163,9 @@ def draw(held: Mapping[str, Row], tuned: Mapping[str, Row], file: Path) -> None:
     def boxes(title: str, rows: Mapping[str, np.ndarray]) -> None:
         panel = next(panels)
         panel.boxplot(list(rows.values()), widths=0.6, flierprops={"markersize": 1.5})
-        panel.set_xticks(range(1, len(rows) + 1), list(rows), fontsize=7)
+        panel.set_xticks(range(1, len(rows) + 1), list(rows))
         panel.set_ylim(0)
-        panel.set_title(title, fontsize=9)
+        panel.set_title(title)
         panel.grid(axis="y", alpha=0.3)
 
     for test in tests:
@@ -178,8 +178,8 @@ def draw(held: Mapping[str, Row], tuned: Mapping[str, Row], file: Path) -> None:
     for number, run in enumerate(held[FULL].runs if FULL in held else []):
         durations = run["interpolation"]["durations"]
         panel.plot(np.linspace(0, 1, len(durations)), durations, marker="o", markersize=3, label=f"seed {number}")
-    panel.set_title("walk to run: seconds", fontsize=9)
-    panel.legend(fontsize=7, frameon=False)
+    panel.set_title("walk to run: seconds")
+    panel.legend()
     figure.savefig(file, dpi=110)
 
 
