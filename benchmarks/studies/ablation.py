@@ -76,18 +76,16 @@ def fitted(found: dvae.Ablation) -> str:
 def main(
     runs: Path,
     page: Path = DOCS / "ablation.md",
-    picture: Path = DOCS / "img" / "ablation.png",
     steps: int = 5,
     seeds: int = 5,
     fitting: int = 500,
     jobs: int = 2,
 ) -> None:
-    """Write the tables and the picture.
+    """Write the tables.
 
     Args:
         runs: directory of the fits, which are continued where they stopped.
         page: where the tables go.
-        picture: where the drawing goes.
         steps: of the sequences on surrogates.
         seeds: surrogates of random weights.
         fitting: steps of a fit.
@@ -101,7 +99,6 @@ def main(
     found = dvae.ablate(method, data, runs, (0, 1, 2), {**TRAINING, "steps": fitting}, jobs, **on_surrogates)
     found.save(runs / "edges.json")
     write(page, fitted(found), name="fitted")
-    found.plot().savefig(picture, dpi=100)
 
 
 if __name__ == "__main__":

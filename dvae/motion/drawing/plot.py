@@ -107,7 +107,9 @@ def futures(
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
     columns = [*sorted({0, now}), *(now + ahead)]
     if ax is None:
-        figure = plt.figure(figsize=(WIDTH, min(2.3, 14 / len(columns))), layout="constrained", FigureClass=Picture)
+        figure = plt.figure(
+            figsize=(WIDTH, min(2.3, 0.6 + 11 / len(columns))), layout="constrained", FigureClass=Picture
+        )
         ax = figure.subplots()
 
     middle = future[:, :, skeleton.root].mean(0)
