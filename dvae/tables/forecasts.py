@@ -97,7 +97,7 @@ class PanelForecasts:
         selected = list(columns or names)[:most]
         n_columns = min(2, len(selected))
         n_rows = -(-len(selected) // n_columns)
-        figure = new_figure(3.5 * n_columns, 1.6 * n_rows + 0.5)
+        figure = new_figure(7, 1.6 * n_rows + 0.7)
         panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True).ravel()
         for axis, name in zip(panels, selected, strict=False):
             self.fan(axis, window, name)
