@@ -1,5 +1,7 @@
 """Configuration of the site, which `make docs` builds from the pages of this folder."""
 
+import base64
+import json
 import os
 import re
 import shutil
@@ -137,13 +139,31 @@ def _shorten_sidebar(_app: object, _page: str, _template: str, context: dict[str
 
 
 def _adapt_links(_app: object, page: str, source: list[str]) -> None:
-    """Adapt links from and to notebooks to their copies."""
+    """Adapt links from and to notebooks to their copies, and add pictures and links to the gallery."""
     if page.startswith("notebooks/"):
         source[0] = source[0].replace("](../docs/", "](../")
     else:
         source[0] = (
             source[0].replace("](../notebooks/", "](notebooks/").replace("](../../notebooks/", "](../notebooks/")
         )
+    if page == "gallery":
+        source[0] = re.sub(r"^\* ([^[].+), `(.+)` \((\w+)\)$", _thumbnail, source[0], flags=re.MULTILINE)
+
+
+def _thumbnail(entry: re.Match[str]) -> str:
+    """Return an entry of the gallery with the first picture of a cell that contains its call."""
+    title, call, name = entry.groups()
+    (notebook,) = (ROOT / "notebooks").glob(f"[0-9][0-9]_{name}.ipynb")
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    calling = (cell for cell in cells if call.removesuffix(")") in "".join(cell["source"]))
+    outputs = (each for cell in calling for each in cell.get("outputs", ()))
+    pictures = (each["data"]["image/png"] for each in outputs if "image/png" in each.get("data", ()))
+    if (picture := next(pictures, None)) is None:
+        raise ValueError(f"the gallery lists {call}, but no cell of {notebook.name} with it shows a picture")
+    file = "notebooks/gallery/" + re.sub(r"\W+", "_", title) + ".png"
+    (ROOT / "docs" / file).parent.mkdir(exist_ok=True)
+    (ROOT / "docs" / file).write_bytes(base64.b64decode("".join(picture)))
+    return f"* [![]({file}) {title}](notebooks/{notebook.name}) `{call}`"
 
 
 class LinkNames(SphinxTransform):

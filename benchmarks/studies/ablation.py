@@ -11,7 +11,7 @@ from dvae.inference.evaluation.estimates import number
 from dvae.runs.ablation import AblatedEdge
 
 from .audits import FAMILY, spread
-from .results import DOCS, Table, write
+from .results import Table, write
 
 NAMES = ("DKF", "SRNN", "DSAE")
 LEVEL = ("p(z_t | z_{t-1}) p(x_t | z_t)", "faithful")
@@ -76,18 +76,16 @@ def fitted(found: dvae.Ablation) -> Table:
 def main(
     runs: Path,
     results: Path | None = None,
-    picture: Path = DOCS / "img" / "ablation.png",
     steps: int = 5,
     seeds: int = 5,
     fitting: int = 500,
     jobs: int = 2,
 ) -> None:
-    """Write the tables and the picture.
+    """Write the tables.
 
     Args:
         runs: directory of the fits, which are continued where they stopped.
         results: folder of the tables, such as benchmarks/results; None prints them.
-        picture: where the drawing goes.
         steps: of the sequences on surrogates.
         seeds: surrogates of random weights.
         fitting: steps of a fit.
@@ -101,7 +99,6 @@ def main(
     found = dvae.ablate(method, data, runs, (0, 1, 2), {**TRAINING, "steps": fitting}, jobs, **on_surrogates)
     found.save(runs / "edges.json")
     write(results, {"ablation/fitted": fitted(found)})
-    found.plot().savefig(picture, dpi=100)
 
 
 if __name__ == "__main__":

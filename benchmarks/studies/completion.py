@@ -30,7 +30,7 @@ from torch import Tensor
 import dvae
 from dvae import motion
 from dvae.data.batch import WHOLE
-from dvae.inference.evaluation.result import new_figure
+from dvae.inference.evaluation.result import new_figure, styled
 from dvae.motion import bodies
 from dvae.motion.geometry.rotations import to_matrix
 from dvae.motion.geometry.skeleton import rotate_about_up
@@ -507,12 +507,13 @@ def tables(out: Path) -> dict[str, Table]:
     return {f"motion_latent_4d/{name}": table for name, table in found.items()}
 
 
+@styled
 def draw(out: Path, file: Path) -> None:
     """Errors by time; and boxes over segments by points and by frames, as the paper's figures 6 and 7."""
     drawn, crossed = curves(out), of_sights(out, [sight for sights in SIGHTS.values() for sight in sights])
     if not drawn and not crossed:
         return
-    figure = new_figure(14, 3.4)
+    figure = new_figure(7, 2.6)
     first, *panels = figure.subplots(1, 3)
     highest = 0.0  # of all but the last frame held, which leaves the picture
     for name, row in drawn.items():
@@ -525,7 +526,7 @@ def draw(out: Path, file: Path) -> None:
         first.fill_between([*points], *ends, color=line.get_color(), alpha=0.15, lw=0)
     first.axvline(SECONDS, color="grey", lw=0.8, ls="--")
     first.set(xlabel="time (s)", title="vertex error (mm)", ylim=(0, 1.2 * highest or None))
-    first.legend(fontsize=7, frameon=False)
+    first.legend()
 
     def boxes(panel: Any, across: Sequence[int], label: str, ways: Mapping[str, Sequence[Sight]]) -> None:
         for place, (way, sights) in enumerate(ways.items()):
@@ -546,8 +547,8 @@ def draw(out: Path, file: Path) -> None:
     boxes(panels[0], POINTS, f"points a frame, {ALL} frames", {**points, "markers alone": [Sight(0, ALL, True)]})
     boxes(panels[1], FRAMES, f"frames, {FEW} points in each", {**frames, "markers alone": alone})
     if panels[1].get_legend_handles_labels()[1]:
-        panels[1].legend(fontsize=7, frameon=False)
-    figure.savefig(file, dpi=110)
+        panels[1].legend()
+    figure.savefig(file, dpi=200)
 
 
 def tried() -> dict[str, tuple[Any, Deviations, dvae.Descent, bool]]:

@@ -74,13 +74,13 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         evaluation.save(folder / "evaluation.json")
     x = test.all()["x"][:1]
     past, future = test.positions(x).split([protocol.observed, protocol.predicted], dim=1)
-    figure = Figure(figsize=(9, 2.6 * len(models)), layout="constrained")
+    figure = Figure(figsize=(7, 2.2 * len(models)), layout="constrained")
     for axes, (name, model) in zip(figure.subplots(len(models)), models.items(), strict=True):
         torch.manual_seed(0)
         observed, horizon = {"x": x[:, : protocol.observed]}, protocol.predicted
         samples = model.forecast(observed, horizon, samples=10, draw_emission=False)["x"]
         futures(test.skeleton, past[0], test.positions(samples)[:, 0], future[0], ax=axes)
-        axes.set_title(name, fontsize=9)
+        axes.set_title(name)
     figure.savefig(out / "futures.png", dpi=150)
     print(f"saved {out / 'futures.png'} and {out / 'evaluation.json'}")
     if command(["report", *map(str, runs.values()), "--out", str(report)]):

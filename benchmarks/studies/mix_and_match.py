@@ -6,6 +6,7 @@ and two processes may work on other seeds at once (`--seeds 0`, `--seeds 1 2`). 
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ from dvae import motion
 from dvae.inference.bounds.probe import RedrawnModel
 from dvae.inference.evaluation.evaluation_windows import seeded_evaluation
 from dvae.inference.evaluation.record import plain
-from dvae.inference.evaluation.result import new_figure
+from dvae.inference.evaluation.result import new_figure, styled
 from dvae.inference.evaluation.scores import Measure
 from dvae.models.motion.codes import CodeDiversity, code_diversity
 from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
@@ -225,12 +226,17 @@ def tables(name: str, found: Mapping[str, Row]) -> dict[str, Table]:
     return {f"mix_and_match/{folder(name)}-{what}": table for what, table in made.items()}
 
 
+@styled
 def draw(found: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None:
     """Codes over training, one panel for each way; and quality against diversity."""
     ways = {name: row.of("futures") for name, row in heard(found).items()}
-    figure = new_figure(14, 3)
-    *panels, last = figure.subplots(1, len(ways) + 1)
-    for panel, (name, way) in zip(panels, ways.items(), strict=True):
+    rows = math.ceil((len(ways) + 1) / 3)
+    figure = new_figure(7, 2.2 * rows + 0.6)
+    panels = list(figure.subplots(rows, 3, squeeze=False).flat)
+    for panel in panels[len(ways) + 1 :]:
+        panel.set_axis_off()
+    last = panels[len(ways)]
+    for panel, (name, way) in zip(panels, ways.items(), strict=False):
         for run in way.runs:
             mean, deviation = (np.array(run["codes"][key]) for key in ("diversity", "deviation"))
             (line,) = panel.plot(run["steps"], mean)
@@ -238,7 +244,7 @@ def draw(found: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None
                 run["steps"], mean - deviation, mean + deviation, color=line.get_color(), alpha=0.15, lw=0
             )
         panel.set_ylim(0)
-        panel.set_title(f"{name}: codes", fontsize=9)
+        panel.set_title(f"{name}: codes")
         panel.set_xlabel("step")
 
     def point(row: Row) -> tuple[float, float]:
@@ -251,14 +257,14 @@ def draw(found: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None
         if points:
             last.plot(*zip(*points.values(), strict=True), marker="o", markersize=4, label=f"alpha, {label}")
             for alpha, where in points.items():
-                last.annotate(alpha, where, fontsize=7, xytext=(3, 3), textcoords="offset points")
+                last.annotate(alpha, where, xytext=(3, 3), textcoords="offset points")
     for place, (name, way) in enumerate(ways.items(), 2):
         last.plot(*point(way), marker="s", linestyle="", color=f"C{place}", label=name)
     last.set_ylim(0)
     last.set_xlabel("APD (m)")
-    last.set_title("quality (%)", fontsize=9)
-    figure.legend(*last.get_legend_handles_labels(), loc="outside right center", fontsize=7, frameon=False)
-    figure.savefig(file, dpi=110)
+    last.set_title("quality (%)")
+    figure.legend(*last.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.savefig(file, dpi=200)
 
 
 def main(

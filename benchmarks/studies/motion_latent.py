@@ -1,7 +1,7 @@
 """Fit and score latent spaces of gait cycles, and write their tables.
 
 Each run has a directory under `--runs`, with measured.json. An interrupted script continues and skips existing files,
-and two processes may work on other cases or seeds at once. Tables and pictures show the available files.
+and two processes may work on other cases or seeds at once. Tables show the available files.
 """
 
 from __future__ import annotations
@@ -19,14 +19,13 @@ import tyro
 import dvae
 from dvae import motion
 from dvae.data import Batch
-from dvae.inference.evaluation.result import new_figure
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
 from .engine import OURS, Row, budget, fitted, folder, interval, measure, read, settings
-from .results import DOCS, Table, tabled, write
+from .results import Table, tabled, write
 
 TUNING, HELD = "tuning", "held out"
 SAME, OTHER = "same source", "other source"
@@ -154,41 +153,11 @@ def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
     return found
 
 
-def draw(held: Mapping[str, Row], tuned: Mapping[str, Row], file: Path) -> None:
-    """Draw box plots of the errors on both test sets and in the sweeps, and durations between walks and runs."""
-    tests, swept = next(iter(held.values())).runs[0]["tests"] if held else [], CASES["swept"]
-    figure = new_figure(3.2 * (len(tests) + len(swept) + 1), 3.4)
-    panels = iter(figure.subplots(1, len(tests) + len(swept) + 1))
-
-    def boxes(title: str, rows: Mapping[str, np.ndarray]) -> None:
-        panel = next(panels)
-        panel.boxplot(list(rows.values()), widths=0.6, flierprops={"markersize": 1.5})
-        panel.set_xticks(range(1, len(rows) + 1), list(rows), fontsize=7)
-        panel.set_ylim(0)
-        panel.set_title(title, fontsize=9)
-        panel.grid(axis="y", alpha=0.3)
-
-    for test in tests:
-        rows = {name.replace(" ", "\n"): errors(row.of(test)) for name, row in held.items() if name != SHAPED}
-        boxes(f"{test}: vertex error (mm)", rows)
-    for title, names in swept.items():
-        there = {value: errors(tuned[name].of(SAME)) for value, name in names.items() if name in tuned}
-        boxes(f"{title}, {TUNING} (mm)", there)
-    panel = next(panels)
-    for number, run in enumerate(held[FULL].runs if FULL in held else []):
-        durations = run["interpolation"]["durations"]
-        panel.plot(np.linspace(0, 1, len(durations)), durations, marker="o", markersize=3, label=f"seed {number}")
-    panel.set_title("walk to run: seconds", fontsize=9)
-    panel.legend(fontsize=7, frameon=False)
-    figure.savefig(file, dpi=110)
-
-
 def main(
     data: Path | None = None,
     other: Path | None = None,
     runs: Path = Path("runs/motion-latent"),
     results: Path | None = None,
-    picture: Path = DOCS / "img" / "motion_latent_4d.png",
     sections: tuple[str, ...] = tuple(SECTIONS),
     cases: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0, 1, 2),
@@ -201,7 +170,6 @@ def main(
         other: motion file of a source outside the training data (cmu8.npz).
         runs: folder of the runs.
         results: folder of the tables, such as benchmarks/results; None prints them.
-        picture: figure of vertex errors, and of durations between walks and runs.
         sections: sections to fit.
         cases: names of cases to fit; all cases of a section if empty.
         seeds: seeds of the runs to fit.
@@ -214,7 +182,6 @@ def main(
     for name, rows in there.items():
         if rows:
             write(results, tables(name, rows))
-    draw(there[HELD], there[TUNING], picture)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 import tyro
-from matplotlib.figure import Figure
+
+from dvae.inference.evaluation.result import new_figure, styled
 
 from .results import DOCS
 
@@ -21,6 +22,7 @@ def example(steps: int = 600) -> dict[str, Any]:
     return variables
 
 
+@styled
 def main(out: Path = DOCS / "img" / "overview.png", steps: int = 600) -> None:
     """Fit and draw.
 
@@ -34,11 +36,11 @@ def main(out: Path = DOCS / "img" / "overview.png", steps: int = 600) -> None:
     torch.manual_seed(0)
     futures = model.forecast({"x": x[:, : test.observed]}, x.shape[1] - test.observed, samples=500)["x"][..., 0]
 
-    figure = Figure(figsize=(9, 4.4), layout="constrained")
+    figure = new_figure(7, 3.6)
     top, bottom = figure.subfigures(2, 1)
     left, right = top.subplots(1, 2)
-    model.generative.draw(4, ax=left).set_title("p(z_t | z_{t-1}) p(x_t | z_t)", fontsize=10)
-    model.inference.draw(4, ax=right).set_title("q(z_t | z_{t-1}, x_{t:T})", fontsize=10)
+    model.generative.draw(4, ax=left).set_title("model: p(z_t | z_{t-1}) p(x_t | z_t)")
+    model.inference.draw(4, ax=right).set_title("guide: q(z_t | z_{t-1}, x_{t:T})")
     panels = bottom.subplots(1, 3, sharey=True)
     for n, panel in enumerate(panels):
         for level in (0.5, 0.9):
@@ -48,7 +50,7 @@ def main(out: Path = DOCS / "img" / "overview.png", steps: int = 600) -> None:
         panel.axvline(test.observed - 0.5, color="0.6", linewidth=0.8)
         panel.set_xlabel("step")
     panels[0].set_ylabel("x")
-    figure.savefig(out, dpi=120)
+    figure.savefig(out, dpi=200)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draws docs/img/packages.png, the picture of docs/walk.md: packages as boxes, who imports whom as edges.
+"""Draws docs/img/packages.png of docs/project/architecture.md: packages as boxes, who imports whom as edges.
 
 It is drawn from the imports in the files. Every box is above all that it imports; an edge that others make
 superfluous is left out, and one upward, which there should not be, is red.
@@ -13,8 +13,9 @@ from pathlib import Path
 import networkx as nx
 import tyro
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
+
+from dvae.inference.evaluation.result import new_figure, styled
 
 from .results import DOCS
 
@@ -127,6 +128,7 @@ def draw(graph: nx.DiGraph, ax: Axes) -> None:
     ax.axis("off")
 
 
+@styled
 def main(out: Path = DOCS / "img" / "packages.png") -> None:
     """Draw.
 
@@ -134,9 +136,9 @@ def main(out: Path = DOCS / "img" / "packages.png") -> None:
         out: where the picture goes.
     """
     graph = imports()
-    figure = Figure(figsize=(9, 1.0 * len(storeys(graph)) + 0.6), layout="constrained")
+    figure = new_figure(7, len(storeys(graph)))
     draw(graph, figure.subplots())
-    figure.savefig(out, dpi=130, bbox_inches="tight")
+    figure.savefig(out, dpi=200)
 
 
 if __name__ == "__main__":

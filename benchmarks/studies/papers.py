@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from dvae.inference.evaluation.result import new_figure
+from dvae.inference.evaluation.result import new_figure, styled
 
 from .engine import Row, cell, settings
 from .ranking import (
@@ -190,9 +190,10 @@ PATHED = ("ADE", "FDE", "energy score")
 """Scores that are drawn by the number of paths."""
 
 
+@styled
 def drawn(found: Found, paper: Paper) -> Figure:
     """Scores by how many paths are given, of the seeds that have all, with intervals over clips, and these seeds."""
-    figure = new_figure(11, 3)
+    figure = new_figure(7, 2.9)
     for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
         for row in (NEIGHBOURS, *paper.rows):
             own = {view.given: rows[row] for view, rows in found.items() if row in rows}
@@ -207,8 +208,8 @@ def drawn(found: Found, paper: Paper) -> Figure:
                 ends = [score.interval(LEVEL, error) for score, error in zip(scores.values(), errors, strict=True)]
                 panel.errorbar([*scores], means, abs(np.transpose(ends) - means), marker="o", markersize=4, label=row)
         panel.set_xlabel("paths given")
-        panel.set_title(f"{column} (m)", fontsize=9)
-    figure.legend(*panel.get_legend_handles_labels(), loc="outside right center", fontsize=8, frameon=False)
+        panel.set_title(f"{column} (m)")
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 
@@ -254,7 +255,7 @@ def main(
             if results is not None:
                 more = (view for each in paper.further for view in each.views if view == View(view.given))
                 seen = {view: entries(stored, paper.set, view, paper.rows) for view in more}
-                drawn(found | seen, paper).savefig(pictures / f"{name}.png", dpi=110)
+                drawn(found | seen, paper).savefig(pictures / f"{name}.png", dpi=200)
         for each in paper.further:
             seen = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
             for called, (row, view) in each.apart.items():

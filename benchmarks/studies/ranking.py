@@ -11,6 +11,7 @@ from __future__ import annotations
 import fnmatch
 import itertools
 import json
+import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ from dvae import Evaluation, Training, files, motion
 from dvae.inference.evaluation.estimates import TwoWayErrors
 from dvae.inference.evaluation.metrics import average_pairwise_distance
 from dvae.inference.evaluation.multiple_comparisons import confidence_set
-from dvae.inference.evaluation.result import new_figure
+from dvae.inference.evaluation.result import new_figure, styled
 from dvae.inference.evaluation.scores import Measure
 from dvae.inference.training.checkpoints import Run
 from dvae.models import registry
@@ -452,12 +453,15 @@ def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> Table:
     return Table(header, lines, f"{best}: {', '.join(confidence_set(tested, level=LEVEL).members)}.")
 
 
+@styled
 def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
     """How far above the neighbours' the energy scores of each set are; rows of all in the first one's order."""
     ranks = {name: ranked(found) for name, found in sets.items()}
     order = list(dict.fromkeys(row for scores in ranks.values() for row in scores if row != NEIGHBOURS))
-    figure = new_figure(1.8 + 3.4 * len(sets), 0.8 + 0.22 * len(order))
-    panels = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
+    columns = min(2, len(sets))
+    rows = math.ceil(len(sets) / columns)
+    figure = new_figure(1.8 + 3.4 * columns, rows * (0.6 + 0.2 * len(order)))
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
     for panel, (name, scores) in zip(panels, ranks.items(), strict=True):
         panel.axvline(0, color="0.6", lw=0.8)
         for row in scores.keys() & order:
@@ -465,10 +469,10 @@ def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
             for error, width in (("sequences", 4), ("total", 1)):
                 panel.plot(minus.interval(LEVEL, error), [height] * 2, color="C0", lw=width, solid_capstyle="butt")
             face = "C0" if scores[row].count >= ENOUGH else "white"
-            panel.plot(minus.mean, height, "o", color="C0", markerfacecolor=face, markersize=5)
-        panel.set_title(name, fontsize=9)
-        panel.set_xlabel(f"{RANKED} minus neighbours' (m)", fontsize=8)
-        panel.tick_params(labelsize=8)
+            panel.plot(minus.mean, height, "o", color="C0", markerfacecolor=face)
+        panel.set_title(name)
+        panel.set_xlabel(f"{RANKED} minus neighbours' (m)")
+        panel.grid(axis="x", alpha=0.3)
     panels[0].set_yticks(range(len(order)), order)
     panels[0].invert_yaxis()
     return figure
@@ -515,7 +519,7 @@ def main(
     sought = {name: rows_of(scores, name, View()) for name, selected in SETS.items() if View() in selected.views}
     futures = {name: rows for name, rows in sought.items() if rows}
     if results is not None and futures:
-        drawn(futures).savefig(picture, dpi=110)
+        drawn(futures).savefig(picture, dpi=200)
 
 
 if __name__ == "__main__":

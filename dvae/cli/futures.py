@@ -13,6 +13,7 @@ import tyro
 
 from .. import motion
 from ..data.sequences import Sequences
+from ..inference.evaluation.result import new_figure, styled
 from ..inference.training.checkpoints import Run
 from ..locking import seeded
 from ..models.motion.trajectories import TrajectoryModel
@@ -496,16 +497,15 @@ def _title(futures: motion.Forecasts) -> str:
     return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures, {EMISSIONS[futures.emission]}"
 
 
+@styled
 def _save_futures(futures: motion.Forecasts, path: Path | None, paths: Mapping[str, Any] | None = None) -> None:
     """Save a figure of the first window's futures and of the given paths, if `path` is not None."""
     if path is None:
         return
-    from matplotlib.figure import Figure
-
     from ..motion.drawing.plot import futures as draw
 
-    drawing = Figure(figsize=(9, 2.6), layout="constrained")
+    drawing = new_figure(7, 2.2)
     window = futures.observed[0], futures.forecasts[:, 0], futures.truth[0]
     axes = draw(futures.skeleton, *window, ax=drawing.subplots(), paths=paths)
-    axes.set_title(_title(futures), fontsize=9, parse_math=False)
+    axes.set_title(_title(futures), parse_math=False)
     save_figure(drawing, path)

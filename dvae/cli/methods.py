@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ..factorization.graph import alternatives, audit
+from ..factorization.graph import Audit, alternatives, audit
 from ..factorization.inversion import guide
 from ..factorization.notation import Factorization
-from ..inference.evaluation.result import Table
+from ..inference.evaluation.result import Table, new_figure, styled
 from ..models import registry
 from ..models.registry import methods, metric_models
 from .console import OUT, UsageError, arguments, at_least, check_figure, save_figure
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from ..inference.training.options import Training
 
 
@@ -92,18 +94,7 @@ def show(
     with arguments():
         pair_audit = audit(*pair, observed=observed, summed=summed)
     if out is not None:
-        from matplotlib.figure import Figure
-
-        graphs = 2 if pair_audit.inference.factors else 1
-        figure = Figure(figsize=(graphs * (0.85 * steps + 1.6), 4.2 if graphs == 2 else 1.6), layout="constrained")
-        model, *guides = figure.subplots(1, graphs, squeeze=False)[0]
-        pair_audit.generative.draw(steps, ax=model, observed=observed).set_title("model")
-        for axes in guides:
-            title = (
-                "guide" if pair_audit.exact else "guide (dashed: dependencies of the exact posterior that it ignores)"
-            )
-            pair_audit.draw(steps, ax=axes).set_title(title)
-        save_figure(figure, out)
+        save_figure(_drawing(pair_audit, steps, observed), out)
     OUT.print(str(pair_audit.generative), highlight=False, markup=False, soft_wrap=True)
     if pair_audit.inference.factors:
         OUT.print(str(pair_audit.inference), highlight=False, markup=False, soft_wrap=True)
@@ -114,6 +105,19 @@ def show(
         OUT.print(f"{reason}: there is no guide, and the bound is the log evidence")
     if method is not None:
         OUT.print("\n".join(_describe_trainings(kind.trainings)), highlight=False, soft_wrap=True)
+
+
+@styled
+def _drawing(pair_audit: Audit, steps: int, observed: Collection[str]) -> Figure:
+    """Draw the model and, if there is one, the guide."""
+    graphs = 2 if pair_audit.inference.factors else 1
+    figure = new_figure(graphs * (0.85 * steps + 1.6), 3 if graphs == 2 else 1.6)
+    model, *guides = figure.subplots(1, graphs, squeeze=False)[0]
+    pair_audit.generative.draw(steps, ax=model, observed=observed).set_title("model")
+    for axes in guides:
+        ignored = "" if pair_audit.exact else "\ndashed: dependencies of the exact\nposterior that the guide ignores"
+        pair_audit.draw(steps, ax=axes).set_title(f"guide{ignored}")
+    return figure
 
 
 def _describe_trainings(trainings: Mapping[str, Training]) -> list[str]:

@@ -21,6 +21,8 @@ Node = tuple[str, int | None]
 Edge = tuple[Node, Node]
 """Edge of a graph: (parent, child)."""
 
+WIDTH = 7.0
+"""Largest width of a new figure in inches: the width of a page."""
 RADIUS = 0.3
 ARROW: dict[str, Any] = {"shrinkA": 0, "shrinkB": 0, "arrowstyle": "-|>", "mutation_scale": 9, "zorder": 2}
 EDGE: dict[str, Any] = {"color": "0.35", "linestyle": "-", "linewidth": 0.9}
@@ -49,7 +51,9 @@ def draw_dag(
     positions = _layout(dag)
     if ax is None:
         right, down = max(x for x, _ in positions.values()), -min(y for _, y in positions.values())
-        _, ax = plt.subplots(figsize=(0.85 * right + 1.2, 0.85 * down + 1.4), layout="constrained")
+        width, height = 0.85 * right + 1.2, 0.85 * down + 1.4
+        scale = min(1, WIDTH / width)
+        ax = plt.subplots(figsize=(scale * width, scale * height), layout="constrained")[1]
 
     def symbol(name: str, t: int | None) -> str:
         word = name if len(name) == 1 else rf"\mathrm{{{name}}}".replace("_", r"\_")

@@ -35,7 +35,7 @@ from ..inference.evaluation.comparison import Comparison
 from ..inference.evaluation.estimates import Estimate, number
 from ..inference.evaluation.multiple_comparisons import holm
 from ..inference.evaluation.record import Dims
-from ..inference.evaluation.result import Result, Table, new_figure, progress_bar
+from ..inference.evaluation.result import Result, Table, new_figure, progress_bar, styled
 from ..inference.training.checkpoints import ENDED
 from ..inference.training.options import Training
 from ..models.family.equations import Equations
@@ -186,6 +186,7 @@ class Ablation(Result):
             table.add_row(edge.name, edge.of, *cells, *([self.notes.get(edge.run, "")] if self.notes else []))
         return table
 
+    @styled
     def plot(self) -> Figure:
         """Draw model and guide of one step, with edges as wide as their cost, on surrogates and, if fitted, on data."""
         parts = [part for part in (self.generative, self.inference) if part.factors]
@@ -195,7 +196,7 @@ class Ablation(Result):
             measured = {run: estimate.mean for run, estimate in self.differences.items()}
             insignificant = {run for run, p in self.p_values.items() if not p < LEVEL}
             rows.append((f"nats a {self._frame}, on data\n(pale: p ≥ {LEVEL})", measured, insignificant))
-        figure = new_figure(5 * len(parts), 3.6 * len(rows))
+        figure = new_figure(3.5 * len(parts), 2.7 * len(rows))
         panels = figure.subplots(len(rows), len(parts), squeeze=False)
         for (unit, costs, pale), row in zip(rows, panels, strict=True):
             top = max(costs.values(), default=0.0)
@@ -204,7 +205,7 @@ class Ablation(Result):
                 runs = {edge[:2]: edge_of(part, *edge[2]).run for edge in graph.edges.data("edge")}
                 of_edges = {edge: costs[run] for edge, run in runs.items() if run in costs}
                 draw_slice(graph, of_edges, panel, top, [edge for edge, run in runs.items() if run in pale])
-                panel.set_title(f"{'model' if part.kind == 'p' else 'guide'}: {unit}", fontsize=10)
+                panel.set_title(f"{'model' if part.kind == 'p' else 'guide'}: {unit}")
         return figure
 
     @property

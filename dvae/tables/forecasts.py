@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import files
 from ..data.sequences import HeldOutWindows, columns_of
-from ..inference.evaluation.result import new_figure
+from ..inference.evaluation.result import new_figure, styled
 from ..inference.evaluation.scores import CRPS, Measure, by_column, calibrated, samples_needed
 from ..options import nearest
 from .calendar import NUMBERS, Calendar
@@ -76,6 +76,7 @@ class PanelForecasts:
         """
         _save(self, path, draws=self.draws, past=self.past, truth=self.truth)
 
+    @styled
     def plot(self, window: int = 0, columns: Sequence[str] | None = None, most: int = 8) -> Figure:
         """Plot prediction bands (50, 80, 95 %) and the median of each coordinate, with the past and the truth.
 
@@ -96,21 +97,20 @@ class PanelForecasts:
         selected = list(columns or names)[:most]
         n_columns = min(2, len(selected))
         n_rows = -(-len(selected) // n_columns)
-        figure = new_figure(5 * n_columns, 1.9 * n_rows + 0.4)
+        figure = new_figure(7, 1.6 * n_rows + 0.7)
         panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True).ravel()
         for axis, name in zip(panels, selected, strict=False):
             self.fan(axis, window, name)
             unit = self.columns[name]
-            axis.set_title(name + (f" ({unit})" if unit else ""), fontsize=9, parse_math=False)
-            axis.tick_params(labelsize=7)
+            axis.set_title(name + (f" ({unit})" if unit else ""), parse_math=False)
         for axis in panels[len(selected) :]:
             axis.set_axis_off()
         for axis in panels[max(len(selected) - n_columns, 0) : len(selected)]:  # the lowest panel of each column
             axis.tick_params(labelbottom=True)
         legends = [axis.get_legend_handles_labels() for axis in panels[: len(selected)]]
         handles, labels = max(legends, key=lambda entry: len(entry[1]))
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
-        figure.suptitle(f"{self.keys[window][0]} from step {self.keys[window][1]}", fontsize=9, parse_math=False)
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure.suptitle(f"{self.keys[window][0]} from step {self.keys[window][1]}", parse_math=False)
         return figure
 
     def fan(self, axis: Axes, window: int, column: str) -> None:
@@ -122,8 +122,8 @@ class PanelForecasts:
             steps = self.calendar.to_pandas(steps)
         past_steps, future_steps, draws = steps[:observed], steps[observed:], self.draws[:, window, :, index]
         if np.isin(self.draws[..., index], (0, 1)).all():  # binary: a share instead of bands
-            axis.plot(future_steps, draws.mean(0), "C0", linewidth=1.2)
-            axis.set_ylabel("share", fontsize=8)
+            axis.plot(future_steps, draws.mean(0), "C0")
+            axis.set_ylabel("share")
             axis.set_ylim(-0.05, 1.05)
         else:
             for level, opacity in BANDS.items():
@@ -131,7 +131,7 @@ class PanelForecasts:
                     continue
                 low, high = _quantile(draws, [(1 - level) / 2, (1 + level) / 2])
                 axis.fill_between(future_steps, low, high, color="C0", alpha=opacity, linewidth=0, label=f"{level:.0%}")
-            axis.plot(future_steps, np.median(draws, 0), "C0", linewidth=1.2, label="median")
+            axis.plot(future_steps, np.median(draws, 0), "C0", label="median")
         axis.plot(past_steps, self.past[window, :, index], color="0.3", linewidth=1, marker=".", markersize=3)
         axis.plot(future_steps, self.truth[window, :, index], "k.", markersize=4, label="truth")
         if is_dated:
@@ -139,8 +139,8 @@ class PanelForecasts:
 
             axis.xaxis.set_major_locator(locator := AutoDateLocator(tz=steps.tz, maxticks=6))
             axis.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=steps.tz))
-        elif self.calendar.kind == "durations":
-            axis.set_xlabel("seconds", fontsize=8)
+        else:
+            axis.set_xlabel("seconds" if self.times is not None else "step")
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ from ..bounds.teacher_forced import length_of
 from ..evaluation.estimates import Estimate, TwoWayErrors, decimals, number
 from ..evaluation.evaluation_windows import clip_index, on_device_of, refuse_non_finite, seeded_evaluation
 from ..evaluation.record import Dims
-from ..evaluation.result import Result, Table, new_figure, progress_bar
+from ..evaluation.result import Result, Table, new_figure, progress_bar, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -177,31 +177,32 @@ class Bracket(Result):
                 table.add_row(f"{name}{at_least} ({low} to {high})", *cells)
         return table
 
+    @styled
     def plot(self) -> Figure:
         """Draw all bounds above the ELBO for real and simulated data, the parts of the gap, and the bracket shaded."""
-        figure = new_figure(9, 6)
+        figure = new_figure(7, 5.4)
         panels = figure.subplots(2, 1)  # separate axes, because a guide may be far worse on simulated data
         unknown = self.estimate("upper", "AIS", "simulated").mean
         for panel, data in zip(panels, DATA, strict=True):
             names = list(self.bounds[data])
             lower = self.estimate("AIS", "ELBO", data).mean
             shade = {"real": "as wide as on simulated data", "simulated": "evidence"}[data]
-            panel.axvspan(lower, lower + max(unknown, 0.0), color="C2", alpha={"real": 0.15, "simulated": 0.35}[data])
-            panel.annotate(shade, (lower, 1), xycoords=("data", "axes fraction"), fontsize=7, va="bottom")
+            panel.axvspan(lower, lower + max(unknown, 0.0), color="0.5", alpha={"real": 0.15, "simulated": 0.35}[data])
+            panel.annotate(shade, (lower, 1), xycoords=("data", "axes fraction"), va="bottom")
             for place, (part, (low, high)) in enumerate(PARTS.items()):
                 if part in self.gap(data) and part != "unknown":
                     ends = [self.estimate(name, "ELBO", data).mean for name in (low, high)]
                     panel.barh(len(names), ends[1] - ends[0], left=ends[0], color=f"C{place}", alpha=0.6, label=part)
             for place, name in enumerate(names):
                 estimate = self.estimate(name, "ELBO", data)
-                panel.errorbar(estimate.mean, place, xerr=_reach(estimate), fmt="o", color="C7", markersize=5)
-            panel.set_yticks(range(len(names) + 1), [*map(self._label, names), "parts of the gap"], fontsize=8)
+                panel.errorbar(estimate.mean, place, xerr=_reach(estimate), fmt="o", color="0.4")
+            panel.set_yticks(range(len(names) + 1), [*map(self._label, names), "parts of the gap"])
             panel.invert_yaxis()
-            panel.set_title(f"{data} data", loc="left", fontsize=10)
+            panel.set_title(f"{data} data", loc="left")
             panel.grid(axis="x", alpha=0.3)
         panels[1].set_xlabel("nats a sequence above the ELBO (95 % over sequences)")
-        figure.legend(*panels[1].get_legend_handles_labels(), loc="outside lower center", ncols=len(PARTS), fontsize=8)
-        figure.suptitle(f"{self.equations['generative']}\n{self.equations['inference']}", fontsize=9, parse_math=False)
+        figure.legend(*panels[1].get_legend_handles_labels(), loc="outside lower center", ncols=len(PARTS))
+        figure.suptitle(f"{self.equations['generative']}\n{self.equations['inference']}", parse_math=False)
         return figure
 
     @override

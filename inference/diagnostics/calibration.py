@@ -26,7 +26,7 @@ from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from ..evaluation.record import Dims
-from ..evaluation.result import Result, Table, new_figure, progress_bar
+from ..evaluation.result import Result, Table, new_figure, progress_bar, styled
 from .latents import quantities
 
 if TYPE_CHECKING:
@@ -139,6 +139,7 @@ class Calibration(Result):
             table.add_row(f"and {len(self.names) - worst} more", style="dim")
         return table
 
+    @styled
     def plot(self, worst: int = 8) -> Figure:
         """Draw rank histograms above ECDF differences, for the quantities with the smallest p-values.
 
@@ -146,7 +147,7 @@ class Calibration(Result):
         simultaneous envelope for all quantities and points, with 95 % probability (Bonferroni over quantities).
         """
         order = np.argsort(self.p_values, kind="stable")[:worst]
-        columns = min(4, len(order))
+        columns = min(3, len(order))
         rows = math.ceil(len(order) / columns)
         figure = new_figure(0.8 + 2.4 * columns, 0.6 + 3.1 * rows)
         panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, sharey="row")
@@ -163,24 +164,22 @@ class Calibration(Result):
             top.stairs(share, edges / levels, color="C0")
             top.axhline(1, color="0.4", linewidth=0.8)
             reading = f"\n{self.readings[q]}" if self.readings[q] else ""
-            top.set_title(f"{self.names[q]}, p = {self.adjusted[q]:.2g}{reading}", fontsize=8, parse_math=False)
+            top.set_title(f"{self.names[q]}, p = {self.adjusted[q]:.2g}{reading}", parse_math=False)
             bottom.fill_between(points, low - points, high - points, color="0.88", step="mid", linewidth=0)
             below = self.counts[q].cumsum()[:-1] / count
-            bottom.plot(points, below - points, color="C0", linewidth=1.2)
+            bottom.plot(points, below - points, color="C0")
             bottom.axhline(0, color="0.4", linewidth=0.8)
             bottom.tick_params(labelbottom=True)
-            for panel in (top, bottom):
-                panel.tick_params(labelsize=7)
             if column == 0:
-                top.set_ylabel("ranks\n/ uniform", fontsize=8)
-                bottom.set_ylabel("ECDF\n− uniform", fontsize=8)
+                top.set_ylabel("ranks\n/ uniform")
+                bottom.set_ylabel("ECDF\n− uniform")
         for place in range(len(order), rows * columns):
             row, column = divmod(place, columns)
             panels[2 * row, column].set_axis_off()
             panels[2 * row + 1, column].set_axis_off()
         selection = "" if len(order) == len(self.names) else f" · worst {len(order)} of {len(self.names)}"
-        figure.suptitle(f"{self._title}{selection}", fontsize=9, parse_math=False)
-        figure.supxlabel(f"rank among {self.draws} draws, scaled to [0, 1]", fontsize=8)
+        figure.suptitle(f"{self._title}{selection}", parse_math=False)
+        figure.supxlabel(f"rank among {self.draws} draws, scaled to [0, 1]")
         return figure
 
     @override

@@ -27,7 +27,7 @@ from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..evaluation.evaluation_windows import on_device_of, prepare_windows, seeded_evaluation
 from ..evaluation.record import MODELS, Dims, plain
-from ..evaluation.result import Result, Table, literal_text, new_figure, progress_bar
+from ..evaluation.result import Result, Table, literal_text, new_figure, progress_bar, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -251,20 +251,20 @@ class PredictiveChecks(Result):
                     table.add_row("", model, *_quantiles(check.replicated), *outcome)
         return table
 
+    @styled
     def plot(self) -> Figure:
         """Draw the density of each statistic: real windows in grey, replicates as one line per model."""
         models, programs, names = self._keys
-        size = (0.6 + 2.3 * len(names), 0.8 + 2.0 * len(programs))
-        figure = new_figure(*size)
-        panels = figure.subplots(len(programs), len(names), squeeze=False, sharex="col")
-        for column, name in enumerate(names):
+        figure = new_figure(0.4 + 3.3 * len(programs), 0.8 + 1.3 * len(names))
+        panels = figure.subplots(len(names), len(programs), squeeze=False, sharex="row")
+        for row, name in enumerate(names):
             checks = [self.checks[model, program, name] for program in programs for model in models[program]]
             values = [array for check in checks for array in (check.real, check.replicated)]
             # outer bins also contain more extreme values, so that one replicate does not flatten the histogram
             low, high = np.quantile(np.stack([np.quantile(v, (0.005, 0.995)) for v in values]), (0, 1))
             edges = np.linspace(low, high if high > low else low + 1, 41)
-            for row, program in enumerate(programs):
-                panel = panels[row, column]
+            unit = f" ({checks[0].unit})" if checks[0].unit else ""
+            for panel, program in zip(panels[row], programs, strict=True):
                 real = self.checks[models[program][0], program, name].real
                 panel.stairs(_density(real, edges), edges, fill=True, color="0.8", label="real")
                 for place, model in enumerate(models["forecast"]):
@@ -273,16 +273,13 @@ class PredictiveChecks(Result):
                     replicated = self.checks[model, program, name].replicated
                     panel.stairs(_density(replicated, edges), edges, color=f"C{place}", label=model, linewidth=1.3)
                 panel.set_yticks([])
-                panel.tick_params(labelsize=7)
-            unit = checks[0].unit
-            panels[-1, column].set_xlabel(f"{name} ({unit})" if unit else name, fontsize=9, parse_math=False)
-        for row, program in enumerate(programs):
-            panels[row, 0].set_ylabel(program, fontsize=9)
+                panel.set_xlabel(name + unit, parse_math=False)
+        for panel, program in zip(panels[0], programs, strict=True):
+            panel.set_title(program)
         handles, labels = panels[0, 0].get_legend_handles_labels()
-        below: dict[str, Any] = {"loc": "outside lower center", "ncols": len(labels), "frameon": False}
-        legend = figure.legend(handles, labels, fontsize=8, **below)
+        legend = figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
         literal_text(legend.get_texts())
-        figure.suptitle(self._title, fontsize=9, parse_math=False)
+        figure.suptitle(self._title, parse_math=False)
         return figure
 
     @override

@@ -29,7 +29,7 @@ from ...program.model import DynamicalVAE
 from ...program.oracle import Oracle
 from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.record import Dims
-from ..evaluation.result import Result, Table, new_figure, progress_bar
+from ..evaluation.result import Result, Table, new_figure, progress_bar, styled
 from .latents import Inferred, Shapes, quantities, some_of
 
 if TYPE_CHECKING:
@@ -250,6 +250,7 @@ class ReferencePosterior(Result):
             table.add_row(str(sequence), f"{sampling.rhat[place, worst]:.3f}", self.names[worst], *map(str, numbers))
         return table
 
+    @styled
     def plot(self, sequence: int = 0, panels: int = 4) -> Figure:
         """Draw means with bands of two standard deviations, deviations of all numbers, and correlations.
 
@@ -270,7 +271,7 @@ class ReferencePosterior(Result):
                 else {(name, name): mask}
             )
         worst = sorted(rows.items(), key=lambda row: -float(np.nanmean(difference[row[1]])))[:panels]
-        figure = new_figure(10.0, 6.2)
+        figure = new_figure(7, 5.4)
         top, bottom = figure.subfigures(2, 1, squeeze=False)[:, 0]
         for panel, ((name, title), numbers) in zip(top.subplots(1, len(worst), squeeze=False)[0], worst, strict=True):
             local = self.shapes[name][0] > 0
@@ -286,12 +287,11 @@ class ReferencePosterior(Result):
                     panel.errorbar(
                         across + 0.2 * (called == "guide"), mean, 2 * deviation, fmt="o", color=colour, label=called
                     )
-            panel.set_title(title, fontsize=8, parse_math=False)
-            panel.set_xlabel("step" if local else "coordinate", fontsize=8)
+            panel.set_title(title, parse_math=False)
+            panel.set_xlabel("step" if local else "coordinate")
             panel.set_xlim(across[0] - 0.5, across[-1] + 0.5)
             panel.xaxis.get_major_locator().set_params(integer=True)
-            panel.tick_params(labelsize=7)
-        top.axes[0].legend(fontsize=7)
+        top.axes[0].legend()
         scatter, *images = bottom.subplots(1, 3)
         for place, name in enumerate(self.shapes):
             mask = latent == place
@@ -300,17 +300,15 @@ class ReferencePosterior(Result):
             )
         ends = [f(part.deviation) for f, part in ((np.nanmin, self.reference), (np.nanmax, self.reference))]
         scatter.plot(ends, ends, color="0.4", linewidth=0.8)
-        scatter.set_xlabel("deviation, reference", fontsize=8)
-        scatter.set_ylabel("deviation, guide", fontsize=8)
-        scatter.tick_params(labelsize=7)
-        scatter.legend(fontsize=7)
+        scatter.set_xlabel("deviation, reference")
+        scatter.set_ylabel("deviation, guide")
+        scatter.legend()
         for panel, part, called in zip(images, (self.reference, self.guide), ("reference", "guide"), strict=True):
             image = panel.imshow(part.correlation[sequence], cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
-            panel.set_title(f"correlations, {called}", fontsize=8)
-            panel.tick_params(labelsize=7)
-        figure.colorbar(image, ax=images, shrink=0.8).ax.tick_params(labelsize=7)
+            panel.set_title(f"correlations, {called}")
+        figure.colorbar(image, ax=images, shrink=0.8)
         title = f"sequence {self.sequences[sequence]} · {self.equations.get('inference', 'custom guide')}"
-        figure.suptitle(f"{title}\n{self.verdict}", fontsize=9, parse_math=False)
+        figure.suptitle(f"{title}\n{self.verdict}", parse_math=False)
         return figure
 
     @override

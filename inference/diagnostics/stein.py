@@ -29,7 +29,7 @@ from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
 from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.record import Dims
-from ..evaluation.result import Result, Table, new_figure, progress_bar
+from ..evaluation.result import Result, Table, new_figure, progress_bar, styled
 from .latents import Inferred, some_of
 
 if TYPE_CHECKING:
@@ -91,6 +91,7 @@ class SteinDiscrepancy(Result):
             table.add_row(str(sequence), str(number), *(f"{value:.3g}" for value in rest))
         return table
 
+    @styled
     def plot(self) -> Figure:
         """Draw KSD^2 of every sequence relative to its 5 % critical value."""
         figure = new_figure(2.5 + 0.3 * len(self.sequences), 3.2)
@@ -99,7 +100,7 @@ class SteinDiscrepancy(Result):
         panel.axhline(1, color="0.4", linewidth=0.8)
         panel.set_xlabel("sequence")
         panel.set_ylabel("KSD² / its 5 % critical value")
-        figure.suptitle(self.equations.get("inference", "custom guide"), fontsize=9, parse_math=False)
+        figure.suptitle(self.equations.get("inference", "custom guide"), parse_math=False)
         return figure
 
     @override

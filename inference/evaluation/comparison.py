@@ -22,7 +22,7 @@ from .evaluation import ARROWS
 from .evaluation_windows import clip_index
 from .multiple_comparisons import ConfidenceSet, Pairs, Requirement, confidence_set, pairs, required
 from .record import MODELS, Dims
-from .result import Result, Table, literal_text, new_figure
+from .result import Result, Table, literal_text, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -224,17 +224,18 @@ class Comparison(Result):
         tables = [self._bound_table(), self._latent_table()]
         return Group(*tables, *([self._free_running_table()] if self.samples else []))
 
+    @styled
     def plot(self) -> Figure:
         """Draw bounds, paired differences to the best, k-hat, and the KL of every local latent over time."""
         ranking = self.ranking
         colours = {name: f"C{place % 10}" for place, name in enumerate(self.rows)}
         latents = list(dict.fromkeys(latent for row in self.rows.values() for latent in row.kl_steps))
         rows = math.ceil((3 + len(latents)) / 2)
-        labels = {name: textwrap.fill(name, 30) for name in ranking}
-        widest = min(30, max(map(len, ranking)))
+        labels = {name: textwrap.fill(name, 20) for name in ranking}
+        widest = min(20, max(map(len, ranking)))
         lines = sum(label.count("\n") + 1 for label in labels.values())
-        heights = [1.4 + 0.25 * lines] + [3.0] * (rows - 1)
-        figure = new_figure(10, sum(heights) + 0.3)
+        heights = [1.4 + 0.25 * lines] + [2.4] * (rows - 1)
+        figure = new_figure(7, sum(heights) + 0.3)
         panels = list(figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": heights}).flat)
         bounds = {name: self[name]["IWAE bound"] for name in ranking}
         differences = {name: self.difference(name, ranking[0]) for name in ranking}
@@ -246,21 +247,21 @@ class Comparison(Result):
                         panel.errorbar(estimate.mean, place, xerr=reach, color=colours[name], elinewidth=width)
                 if estimate.freedom[-1] > 0:
                     freedom = f"{estimate.freedom[-1]:.2g} df"
-                    above = {"xytext": (-2, 4), "textcoords": "offset points", "ha": "right", "fontsize": 7}
+                    above = {"xytext": (-2, 4), "textcoords": "offset points", "ha": "right", "fontsize": 8}
                     panel.annotate(freedom, (1, place), xycoords=("axes fraction", "data"), **above)
-                panel.plot(estimate.mean, place, "o", markersize=5, color=colours[name], label=labels[name])
+                panel.plot(estimate.mean, place, "o", color=colours[name], label=labels[name])
             panel.set_ylim(len(ranking) - 0.5, -0.5)
             panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)
             unit, _, frame = self._words
-            panel.set_xlabel(f"nats a {frame} (95 %, thick: over {unit}s, thin: over {unit}s and seeds)", fontsize=9)
+            panel.set_xlabel(f"nats a {frame}; 95 % intervals over\n{unit}s (thick), also seeds (thin)")
             panel.grid(axis="x", alpha=0.3)
         for place, name in enumerate(ranking):
             if "FIVO bound" in self.rows[name].bounds:
                 mean = self[name]["FIVO bound"].mean
                 panels[0].plot(mean, place, "D", markersize=6, color="black", fillstyle="none")
-        title = f"importance-weighted bound ↑ (K = {self.particles})"
-        panels[0].set_title(title + (f", ◇ FIVO (K = {self.filter_particles})" if self.filter_particles else ""))
-        panels[1].set_title(f"difference to {ranking[0]}", parse_math=False)
+        title = f"IWAE bound ↑ (K = {self.particles})"
+        panels[0].set_title(title + (f"\n◇ FIVO bound (K = {self.filter_particles})" if self.filter_particles else ""))
+        panels[1].set_title("difference to\n" + textwrap.shorten(ranking[0], 40), parse_math=False)
         panels[1].axvline(0, color="grey", linewidth=0.8)
         panels[1].set_yticklabels([])
         self._khat_panel(panels[2], colours)
@@ -276,9 +277,9 @@ class Comparison(Result):
                 panel.set(yscale="log", ylim=(least / 1.5, top * 1.5))
         for panel in panels[3 + len(latents) :]:
             panel.set_axis_off()
-        columns = min(5, 100 // (widest + 5))
+        columns = max(1, 75 // (widest + 5))
         handles = panels[0].get_legend_handles_labels()
-        legend = figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=9)
+        legend = figure.legend(*handles, loc="outside lower center", ncols=columns)
         literal_text(legend.get_texts())
         return figure
 
@@ -295,10 +296,10 @@ class Comparison(Result):
         panel.set(title="Pareto k-hat of the weights", xlabel=f"k-hat (unreliable above {KHAT})")
         panel.set(ylabel="share of sequences", xlim=(left, right), ylim=(0, 1.02))
         if not khats:
-            missing = f"not estimated with fewer than {KHAT_PARTICLES} particles"
-            panel.text(0.5, 0.5, missing, transform=panel.transAxes, ha="center", fontsize=9)
+            missing = f"not estimated with fewer\nthan {KHAT_PARTICLES} particles"
+            panel.text(0.5, 0.5, missing, transform=panel.transAxes, ha="center")
         if panel.get_legend_handles_labels()[1]:
-            panel.legend(fontsize=8)
+            panel.legend()
 
     def to_arviz(self) -> dict[str, Any]:
         """Return `{name: DataTree}` for `arviz_stats.compare` and `arviz_stats.loo`.

@@ -37,7 +37,7 @@ from .evaluation import Evaluation
 from .evaluation_windows import EvaluationWindows, clip_index, prepare_windows, seeded_evaluation
 from .record import Dims
 from .references import References
-from .result import Result, Table, new_figure, progress_bar
+from .result import Result, Table, new_figure, progress_bar, styled
 from .scores import Measure, clip_means
 
 if TYPE_CHECKING:
@@ -203,6 +203,7 @@ class PredictionBands(Result):
             )
         return table
 
+    @styled
     def plot(self) -> Figure:
         """Draw factors over the horizon, for single numbers as mean and range over coordinates."""
         figure = new_figure(4.5, 3)
@@ -213,9 +214,9 @@ class PredictionBands(Result):
         for place, (region, factor) in enumerate(self.factors.items()):
             axes.plot(frames, np.broadcast_to(factor, numbers.shape).mean(1), color=f"C{place}", label=region)
         axes.set_ylim(bottom=0)
-        axes.set_xlabel(f"{axis_names(self.data)[1]} of the future", fontsize=8)
-        axes.set_ylabel("half width / spread", fontsize=8)
-        axes.legend(fontsize=8)
+        axes.set_xlabel(f"{axis_names(self.data)[1]} of the future")
+        axes.set_ylabel("half width / spread")
+        axes.legend()
         return figure
 
     @override

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +18,7 @@ from ...options import nearest
 from ..diagnostics.calibration import envelope
 from .estimates import clustered_variance, decimals, effective_number, linearised, student_interval
 from .record import MODELS, Dims
-from .result import Result, Table, new_figure
+from .result import Result, Table, new_figure, styled
 from .scores import Metric
 
 if TYPE_CHECKING:
@@ -177,10 +178,11 @@ class Evaluation(Result):
                 table.add_row(Text.assemble(name + ARROWS[metric.better], (unit, "dim")), *values)
         return table
 
+    @styled
     def plot(self, metrics: Sequence[str] | None = None) -> Figure:
         """Draw one panel per metric, with a dot and a bar of one standard error per method."""
         names = list(self.metrics if metrics is None else metrics)
-        columns = min(4, len(names))
+        columns = min(3, len(names))
         rows = math.ceil(len(names) / columns)
         height = 0.7 + 0.22 * len(self.rows)
         figure = new_figure(2 + 2.2 * columns, height * rows)
@@ -193,10 +195,9 @@ class Evaluation(Result):
                     panel.errorbar(row[name].mean, place, xerr=error, fmt="o", markersize=4, color=f"C{place}")
             metric = self.metrics[name]
             unit = f" ({metric.unit})" if metric.unit else ""
-            panel.set_title(name + ARROWS[metric.better] + unit, fontsize=9, parse_math=False)
+            panel.set_title(name + ARROWS[metric.better] + unit, parse_math=False)
             panel.set_yticks(range(len(scores)), list(scores), parse_math=False)
             panel.set_ylim(len(scores) - 0.5, -0.5)
-            panel.tick_params(labelsize=8)
             panel.locator_params(axis="x", nbins=4)  # more ticks would overlap if values agree in many digits
             panel.grid(axis="x", alpha=0.3)
         for panel in panels[len(names) :]:
@@ -234,6 +235,7 @@ class Evaluation(Result):
         _, low, high = envelope(n_effective, len(points), alpha)
         return points, below - points, low - points, high - points
 
+    @styled
     def plot_calibration(self, histogram: str = "PIT") -> Figure:
         """Draw the PIT histogram of each method, and below it the `departure` of its distribution from uniform.
 
@@ -247,24 +249,31 @@ class Evaluation(Result):
         methods = [method for method, row in self.rows.items() if histogram in row.histograms]
         if not methods:
             raise KeyError(f"no method has a histogram {histogram!r}; evaluate with scores=calibrated")
-        figure = new_figure(0.8 + 2.4 * len(methods), 3.7)
-        panels = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey="row")
-        for (top, bottom), method in zip(panels.T, methods, strict=True):
+        columns = min(3, len(methods))
+        rows = math.ceil(len(methods) / columns)
+        figure = new_figure(0.8 + 2.4 * columns, 0.5 + 3.2 * rows)
+        panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, sharey="row")
+        for panel in panels[-2:, len(methods) - columns * rows :].flat if len(methods) < columns * rows else ():
+            panel.set_axis_off()
+        for place, method in enumerate(methods):
+            row, column = divmod(place, columns)
+            top, bottom = panels[2 * row : 2 * row + 2, column]
             self._draw(top, method, histogram)
-            top.set_title(f"{method}, K = {self.rows[method].samples}", fontsize=8, parse_math=False)
+            top.set_title(textwrap.fill(f"{method}, K = {self.rows[method].samples}", 26), parse_math=False)
             points, difference, low, high = self.departure(method, histogram)
             bottom.fill_between(points, low, high, color="0.88", step="mid", linewidth=0)
-            bottom.plot(points, difference, color="C0", linewidth=1.2)
+            bottom.plot(points, difference, color="C0")
             bottom.axhline(0, color="0.4", linewidth=0.8)
-            for panel in (top, bottom):
-                panel.tick_params(labelsize=7)
-        panels[0, 0].set_ylim(bottom=0)
-        panels[0, 0].set_ylabel(f"{histogram}\n/ uniform", fontsize=8, parse_math=False)
-        panels[1, 0].set_ylabel("ECDF\n− uniform", fontsize=8)
-        figure.suptitle(self._title(), fontsize=9, parse_math=False)
-        figure.supxlabel(f"{histogram} of the true future among the forecasts", fontsize=8, parse_math=False)
+            top.set_ylim(bottom=0)
+            bottom.tick_params(labelbottom=True)
+        for top, bottom in panels[:, 0].reshape(rows, 2):
+            top.set_ylabel(f"{histogram}\n/ uniform", parse_math=False)
+            bottom.set_ylabel("ECDF\n− uniform")
+        figure.suptitle(self._title(), parse_math=False)
+        figure.supxlabel(f"{histogram} of the true future among the forecasts", parse_math=False)
         return figure
 
+    @styled
     def plot_horizon(self) -> Figure:
         """Draw PIT histograms at some frames of the future, and coverage over these frames, for each method.
 
@@ -291,9 +300,11 @@ class Evaluation(Result):
             for panel, (place, name) in zip(histogram_panels, histograms.items(), strict=True):
                 self._draw(panel, method, name)
                 panel.sharey(histogram_panels[0])
-                panel.set_title(f"{frame} {place}", fontsize=8)
+                panel.set_title(f"{frame} {place}")
+                panel.set_xlabel("PIT")
+                panel.set_xticks([0, 1])
             histogram_panels[0].set_ylim(bottom=0)
-            histogram_panels[0].set_ylabel(f"{method}\nPIT / uniform", fontsize=8, parse_math=False)
+            histogram_panels[0].set_ylabel(f"{textwrap.fill(method, 18)}\nPIT / uniform", parse_math=False)
             scores = self[method]
             for order, level in enumerate((50, 80, 90)):
                 covered = {place: scores[name] for place, name in by_frame(f"coverage {level} %", scores).items()}
@@ -304,13 +315,12 @@ class Evaluation(Result):
                 coverage_panel.fill_between(
                     [*covered], means - 2 * errors, means + 2 * errors, color=f"C{order}", alpha=0.2, linewidth=0
                 )
-                coverage_panel.plot([*covered], means, color=f"C{order}", linewidth=1.2)
+                coverage_panel.plot([*covered], means, color=f"C{order}")
                 coverage_panel.axhline(level / 100, color=f"C{order}", linewidth=0.8, linestyle=":")
             coverage_panel.set_ylim(0, 1)
-            coverage_panel.set_title(f"coverage by {frame}", fontsize=8, parse_math=False)
-        for panel in panels.flat:
-            panel.tick_params(labelsize=7)
-        figure.suptitle(self._title(), fontsize=9, parse_math=False)
+            coverage_panel.set_title("coverage")
+            coverage_panel.set_xlabel(frame, parse_math=False)
+        figure.suptitle(self._title(), parse_math=False)
         return figure
 
     def _draw(self, panel: Axes, method: str, histogram: str) -> None:

@@ -1,14 +1,15 @@
 """Base class of results, with tables, JSON and netCDF files; progress bars."""
 
+import functools
 import io
 import json
 import os
 import reprlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Self, TypeVar
 
 import numpy as np
 import rich.table
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     import matplotlib.text
     import xarray as xr
     from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 LARGEST = 2**28
 """Largest size of a result file, in bytes."""
@@ -89,10 +93,25 @@ def error_message(error: BaseException) -> str:
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure with a size in inches; matplotlib is imported only on use."""
-    from .picture import Picture
+    """Return an empty figure with a size in inches, at most as wide as a page; matplotlib is imported only on use."""
+    from .picture import WIDTH, Picture
 
-    return Picture(figsize=(width, height), layout="constrained")
+    return Picture(figsize=(min(width, WIDTH), height), layout="constrained")
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Make a function draw in the house style, `picture.STYLE`; matplotlib's global settings stay as they are."""
+
+    @functools.wraps(draw)
+    def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
+        from matplotlib import rc_context
+
+        from .picture import STYLE
+
+        with rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return in_style
 
 
 def literal_text(texts: "Iterable[matplotlib.text.Text]") -> None:

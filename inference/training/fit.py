@@ -27,7 +27,7 @@ from ...program.batch import check_scale
 from ...program.conditional import like
 from ...program.model import DynamicalVAE
 from ...program.rollout import ScheduledSampling
-from ..evaluation.result import literal_text
+from ..evaluation.result import literal_text, styled
 from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
 from .last_value import last_value_bound
@@ -124,6 +124,7 @@ class Fit:
         rows = [row for row in self.history if name in row]
         return [row["step"] for row in rows], [row[name] for row in rows]
 
+    @styled
     def plot(self) -> "Figure":
         """Draw the learning curves: the bound, and the KL of each latent, in nats per step.
 
@@ -131,11 +132,14 @@ class Fit:
         """
         from matplotlib import pyplot as plt
 
+        from ..evaluation.picture import Picture
+
         names = sorted({name for row in self.history for name in row})
         likelihood = any(name.startswith("log_likelihood/") for name in names)
         score, start = ("bound", "kl/") if likelihood else ("loss", "energy/")
         unit = f"nats per {self.per}" if likelihood else f"per {self.per}"
-        figure, (score_panel, term_panel) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+        figure = plt.figure(figsize=(7, 2.5), layout="constrained", FigureClass=Picture)
+        score_panel, term_panel = figure.subplots(1, 2)
         score_panel.plot(*self.series(score), color="0.7", label="training batch")
         if self.best_step is not None:
             score_panel.plot(*self.series(f"validation/{score}"), marker=".", label="validation")

@@ -18,6 +18,8 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from torch import Tensor
 
+from ...inference.evaluation.picture import WIDTH, Picture
+from ...inference.evaluation.result import new_figure, styled
 from ..geometry.skeleton import Skeleton, rotate_about_up
 
 PAST, TRUTH, FIXED, GIVEN, SKIN = "black", "#1a7f37", "#4a4f57", "#cf222e", "#c3b2a1"
@@ -64,6 +66,7 @@ def hide_axes(ax: Axes) -> None:
     ax.spines[:].set_visible(False)
 
 
+@styled
 def futures(
     skeleton: Skeleton,
     observed: Any,
@@ -105,7 +108,10 @@ def futures(
     ahead = np.unique(np.linspace(0, horizon, frames + 1)[1:].round().clip(1)).astype(int)
     columns = [*sorted({0, now}), *(now + ahead)]
     if ax is None:
-        ax = plt.subplots(figsize=(max(1.15 * len(columns), 4.6), 2.3), layout="constrained")[1]
+        figure = plt.figure(
+            figsize=(WIDTH, min(2.3, 0.6 + 11 / len(columns))), layout="constrained", FigureClass=Picture
+        )
+        ax = figure.subplots()
 
     middle = future[:, :, skeleton.root].mean(0)
 
@@ -251,8 +257,6 @@ def _add_legend(ax: Axes, samples: int, truth: bool, paths: bool) -> None:
         bbox_to_anchor=(0.5, 0),
         borderaxespad=2,  # the height of the time labels
         ncols=len(key),
-        frameon=False,
-        fontsize="small",
     )
 
 
@@ -315,6 +319,7 @@ def _as_arrays(
     return past, future, real
 
 
+@styled
 def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = "y", title: str = "") -> Figure:
     """Draw bodies next to each other, seen from the front of a person with heading zero.
 
@@ -347,8 +352,8 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
     size = np.ptp(people, axis=(0, 1)) + 0.2
     places = _places(len(people), size)
     columns, rows = len({*places[:, 0]}), len({*places[:, 2]})
-    width = min(9.0, 4.5 * columns)
-    figure = Figure(figsize=(width, min(9.0, width * rows * size[2] / (columns * size[0]))), layout="constrained")
+    width = min(WIDTH, 4.5 * columns)
+    figure = new_figure(width, min(9.0, width * rows * size[2] / (columns * size[0])))
     ax = figure.subplots()
     for name, body, place in zip(names, people, places, strict=True):
         ax.add_collection(_mesh(corners, body + place))

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...data.sequences import mean_of_known
 from ...inference.diagnostics.checks import Statistic, variance
 from ...inference.diagnostics.traversal import Traversal
-from ...inference.evaluation.result import new_figure
+from ...inference.evaluation.result import new_figure, styled
 from ..data.exchange import ExchangedWindows
 from ..data.protocols import Windows
 
@@ -64,6 +64,7 @@ def statistics(windows: Windows | ExchangedWindows) -> dict[str, Statistic]:
     }
 
 
+@styled
 def draw_traversal(
     found: Traversal, windows: Windows | ExchangedWindows, frame: int = -1, sequence: int = 0, rows: int = 6
 ) -> Figure:
@@ -84,7 +85,7 @@ def draw_traversal(
     poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
     middle = int(found.offsets.abs().argmin())
     azimuth = math.pi / 5 - final_heading(skeleton, poses[0, middle : middle + 1])
-    figure = new_figure(0.5 + 0.95 * len(found.offsets), 0.6 + 1.9 * len(order))
+    figure = new_figure(0.5 + 0.8 * len(found.offsets), 0.6 + 1.6 * len(order))
     panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     for panel, coordinate, row in zip(panels, order.tolist(), poses, strict=True):
         for column, shifted in enumerate(row):
@@ -95,10 +96,9 @@ def draw_traversal(
         title = (
             f"{found.latent}[{found.coordinates[coordinate]}], which moves x by {float(found.effect[coordinate]):.2g} m"
         )
-        panel.set_title(title, loc="left", fontsize=8)
-        panel.tick_params(labelsize=8)
+        panel.set_title(title, loc="left")
     panels[-1].set_xticks(
         SPACING * np.arange(len(found.offsets)), [f"{o:+.2g}" if o else "0" for o in found.offsets.tolist()]
     )
-    panels[-1].set_xlabel(f"offset of {found.latent}, {found.unit} standard deviations", fontsize=9)
+    panels[-1].set_xlabel(f"offset of {found.latent}, {found.unit} standard deviations")
     return figure

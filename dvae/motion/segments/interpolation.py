@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...data.batch import WHOLE
 from ...inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
-from ...inference.evaluation.result import Table, literal_text, new_figure
+from ...inference.evaluation.result import Table, literal_text, new_figure, styled
 from ..bodies import Body
 from ..data.clips import MotionSet
 from .embodied import SHAPE, surfaces_of
@@ -182,6 +182,7 @@ def falls(values: Tensor) -> Tensor:
 
 
 @torch.no_grad()
+@styled
 def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> Figure:
     """Draw a map of the latent space: means of the guide on their first two principal axes, coloured by a label.
 
@@ -209,7 +210,7 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
     _, spread, axes = torch.linalg.svd(centred, full_matrices=False)
     coordinates, shares = (centred @ axes.T).numpy(), (spread.square() / spread.square().sum()).numpy()
     columns = -(-len(names) // 20)
-    figure = new_figure(5.0 + 1.3 * columns, 4.2)
+    figure = new_figure(4.5 + 1.3 * columns, 4.0)
     panel = figure.subplots()
     for n, name in enumerate(names):
         first, second = coordinates[np.array([label == name for label in labels]), :2].T
@@ -218,5 +219,5 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
     panel.set_xlabel(f"first axis of z, {shares[0]:.0%} of variance")
     panel.set_ylabel(f"second axis, {shares[1]:.0%}")
     panel.set_aspect("equal", "datalim")
-    literal_text(figure.legend(loc="outside right upper", fontsize=7, ncols=columns).get_texts())
+    literal_text(figure.legend(loc="outside right upper", ncols=columns).get_texts())
     return figure

@@ -25,7 +25,7 @@ from ...inference.evaluation.estimates import clustered_variance, linearised
 from ...inference.evaluation.evaluation import ARROWS, Score
 from ...inference.evaluation.evaluation_windows import clip_index, on_device_of, seeded_evaluation
 from ...inference.evaluation.record import MODELS, Dims
-from ...inference.evaluation.result import Result, Table, literal_text, new_figure, progress_bar
+from ...inference.evaluation.result import Result, Table, new_figure, progress_bar, styled
 from ...inference.evaluation.scores import TEACHER_FORCED, Metric, clip_means
 from ...options import nearest
 from ..bodies import vertex_error
@@ -94,17 +94,18 @@ class Reconstruction(Result):
             table.add_row(row, *cells, f"{np.median(values[ERROR]):.1f}")
         return table
 
+    @styled
     def plot(self) -> Figure:
         """Draw Tukey's box plots of vertex errors: quartiles, whiskers to 1.5 interquartile ranges, and outliers."""
-        figure = new_figure(1.6 + 1.2 * len(self.rows), 3.4)
+        figure = new_figure(7, 0.8 + 0.3 * len(self.rows))
         axes = figure.subplots()
-        axes.boxplot([row[ERROR] for row in self.rows.values()], widths=0.6, flierprops={"markersize": 2})
-        axes.set_xticks(range(1, len(self.rows) + 1), list(self.rows), fontsize=8)
-        literal_text(axes.get_xticklabels())
-        axes.set_ylim(bottom=0)
-        axes.set_ylabel("vertex error (mm)")
-        axes.set_title(f"{len(self.segments)} segments", fontsize=9)
-        axes.grid(axis="y", alpha=0.3)
+        axes.boxplot([row[ERROR] for row in self.rows.values()], vert=False, widths=0.6, flierprops={"markersize": 2})
+        axes.set_yticks(range(1, len(self.rows) + 1), list(self.rows), parse_math=False)
+        axes.invert_yaxis()
+        axes.set_xlim(left=0)
+        axes.set_xlabel("vertex error (mm)")
+        axes.set_title(f"{len(self.segments)} segments")
+        axes.grid(axis="x", alpha=0.3)
         return figure
 
     @override
