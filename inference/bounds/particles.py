@@ -314,8 +314,8 @@ def effective_size(log_weights: Tensor) -> Tensor:
 def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
     """Return the rows (K B,) of ancestors under systematic resampling with weights (K, B).
 
-    Particle k has floor(K w_k) descendants or one more, and K w_k on average. Particles of sequences with
-    `mask` (B,) False are their own ancestors.
+    Particle k has floor(K w_k) descendants or one more, and K w_k on average. Particles of sequences
+    where `mask` (B,) is False are their own ancestors.
     """
     count, batch = log_weights.shape
     identity = torch.arange(count, device=log_weights.device)[:, None]

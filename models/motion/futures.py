@@ -200,7 +200,7 @@ class FedBackNetwork(Network):
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the inputs known at each step, the pose before the first (B, D), and the first state (B, W).
 
-        The inputs are (B, T, known), or (B, 1, known) if they are the same at all steps.
+        The inputs are (B, T, known_size), or (B, 1, known_size) if they are the same at all steps.
 
         Args:
             parents: values of the parents by name.
