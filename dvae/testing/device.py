@@ -48,26 +48,21 @@ class OnDevice(Tensor):
 
     # a device number that no machine has: caches of real devices cannot be used by mistake
     device: ClassVar[torch.device] = torch.device("cuda", 127)  # type: ignore[misc]
-    cpu_tensor: Tensor
+    own: Tensor
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
-    def __new__(cls, cpu_tensor: Tensor, requires_grad: bool = False) -> Self:  # noqa: D102
+    def __new__(cls, own: Tensor, requires_grad: bool = False) -> Self:  # noqa: D102
         tensor: Any = Tensor._make_wrapper_subclass(
-            cls,
-            cpu_tensor.shape,
-            cpu_tensor.stride(),
-            cpu_tensor.storage_offset(),
-            dtype=cpu_tensor.dtype,
-            requires_grad=requires_grad,
+            cls, own.shape, own.stride(), own.storage_offset(), dtype=own.dtype, requires_grad=requires_grad
         )
-        tensor.cpu_tensor = cpu_tensor
+        tensor.own = own
         return tensor  # type: ignore[no-any-return]
 
     @override
     def __repr__(self) -> str:  # type: ignore[override]
-        return f"OnDevice({self.cpu_tensor!r})"
+        return f"OnDevice({self.own!r})"
 
     @classmethod
     @override
@@ -100,7 +95,7 @@ class Traffic(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         tensors = list(_tensors((*args, *kwargs.values())))
-        device_tensors = {id(value.cpu_tensor): value for value in tensors if isinstance(value, OnDevice)}
+        device_tensors = {id(value.own): value for value in tensors if isinstance(value, OnDevice)}
         cpu_tensors = [value for value in tensors if not isinstance(value, OnDevice) and value.dim()]
         device, packet = kwargs.get("device"), func.overloadpacket
         is_requested = device is not None and device.type == "cuda"
@@ -133,7 +128,7 @@ class Traffic(TorchDispatchMode):
             raise RuntimeError(
                 f"{packet} of tensors on {OnDevice.device} and on the CPU {shapes}; move them to one device"
             )
-        cpu_args = [_map_tensors(value, OnDevice, lambda v: v.cpu_tensor) for value in (*args, *kwargs.values())]
+        cpu_args = [_map_tensors(value, OnDevice, lambda v: v.own) for value in (*args, *kwargs.values())]
         result = func(*cpu_args[: len(args)], **dict(zip(kwargs, cpu_args[len(args) :], strict=True)))
         if torch.Tag.inplace_view in func.tags:  # the wrapper stores its own shape
             with no_dispatch():
@@ -159,7 +154,7 @@ class _Moves(TorchFunctionMode):
             if func is not Tensor.tolist:
                 raise TypeError(f"a tensor on {OnDevice.device} cannot become an array; move it to the CPU first")
             self.traffic.reads.append(_origin("tolist"))
-            return args[0].cpu_tensor.tolist()
+            return args[0].own.tolist()
         before, self.traffic.within = self.traffic.within, any(isinstance(value, OnDevice) for value in _tensors(args))
         try:
             result = func(*args, **kwargs)
@@ -182,7 +177,7 @@ class _Moves(TorchFunctionMode):
             self.traffic.uploads.append(_origin("to"))
             return OnDevice(cast.detach(), value.requires_grad)
         self.traffic.reads.append(_origin("to"))
-        return cast.cpu_tensor  # type: ignore[attr-defined, no-any-return]
+        return cast.own  # type: ignore[attr-defined, no-any-return]
 
 
 def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:

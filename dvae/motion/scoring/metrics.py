@@ -92,11 +92,11 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
     return truths
 
 
-def multimodal_note(threshold: float, itself: bool, singletons: int, windows: int) -> str:
+def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:
     """Return the explanation of multimodal errors for the caption of a table."""
     own = "; they include the window itself" if itself else ""
     closer = f"windows whose last observed pose is closer than {threshold:g} m{own}"
-    return f"MM (multimodal): true futures are those of all {closer}; {singletons} of {windows} have no other"
+    return f"MM (multimodal): true futures are those of all {closer}; {alone} of {windows} have no other"
 
 
 def multimodal_errors(samples: Array, truths: Array) -> Tensor:
