@@ -179,9 +179,9 @@ def flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield f"{prefix}{name}", value
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, candidates: Iterable[str]) -> str:
     """Return " (did you mean ...?)" with the most similar known name, or "" if no name is similar."""
-    close = difflib.get_close_matches(name[:LONGEST], list(known), n=1)
+    close = difflib.get_close_matches(name[:LONGEST], list(candidates), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

@@ -88,7 +88,7 @@ class View:
         conditioned = windows.given([*JOINTS, *others][: self.given])
         if not self.exchanged or split != "test":
             return conditioned
-        return motion.ExchangedWindows(conditioned, self.exchanged, own=self.own, truth=self.truth)
+        return motion.ExchangedWindows(conditioned, self.exchanged, own_pose=self.own, truth=self.truth)
 
     def evaluate(self, samples: int) -> dict[str, Any]:
         """Arguments of `dvae.evaluate`."""

@@ -61,13 +61,13 @@ FAMILIES = {name.partition(" ")[0] for name in COMMANDS if " " in name}
 """First words of commands of two words."""
 
 
-def named(given: Sequence[str]) -> str | None:
+def named(arguments: Sequence[str]) -> str | None:
     """Return the name of the command in the arguments; None without a command.
 
     Raises:
         UsageError: the command is unknown.
     """
-    words = given[: 2 if given and given[0] in FAMILIES else 1]
+    words = arguments[: 2 if arguments and arguments[0] in FAMILIES else 1]
     if not words or words[-1].startswith("-") or (len(words) < 2 and words[0] in FAMILIES):
         return None
     name = " ".join(words)
@@ -77,13 +77,13 @@ def named(given: Sequence[str]) -> str | None:
     return name
 
 
-def command(given: Sequence[str]) -> Callable[..., None] | None:
+def command(arguments: Sequence[str]) -> Callable[..., None] | None:
     """Import and return the command in the arguments; None without a command.
 
     Raises:
         UsageError: the command is unknown.
     """
-    if (name := named(given)) is None:
+    if (name := named(arguments)) is None:
         return None
     module, _, function = COMMANDS[name][0].partition(":")
     return getattr(import_module(f"{__package__}.{module}"), function)  # type: ignore[no-any-return]

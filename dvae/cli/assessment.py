@@ -42,7 +42,7 @@ class Control:
     exchange: float | None = None
     temperature: float | None = None
 
-    def windows(self, windows: motion.Windows, loaded: Sequence[runs.Loaded]) -> Any:
+    def windows(self, windows: motion.Windows, loaded_runs: Sequence[runs.Loaded]) -> Any:
         """Return the windows with the given paths and exchanged poses.
 
         Raises:
@@ -50,7 +50,7 @@ class Control:
         """
         if self == Control():
             return windows
-        for run in loaded:
+        for run in loaded_runs:
             if not isinstance(run.model, TrajectoryModel):
                 raise UsageError(
                     f"--joints, --exchange and --temperature are for methods that take trajectories; {run.path} is a "
@@ -133,7 +133,7 @@ def _forecasts(paths: Sequence[Path], data: str | None, scoring: ForecastScoring
     """Score forecasts of test windows; return the scores and the name of their file."""
     loaded = loading.with_equal_windows(paths, data, failed=scoring.failed)
     data_set = loading.data_of(data, *loaded, missing=scoring.missing)
-    windows = loading.windows_to_test(loaded[0], data_set, whole=False)
+    windows = loading.windows_to_test(loaded[0], data_set, whole_sequences=False)
     temperature = scoring.control.temperature
     scores: Scores = loading.SCORES[loaded[0].config.kind]
     if loaded[0].config.kind == "motion":

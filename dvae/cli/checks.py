@@ -84,7 +84,7 @@ def calibration(
     at_least(19, samples=samples)
     check_files(out, figure, ".json")
     loaded, data_set = loading.forecaster(run, data, missing, failed)
-    model, windows = loaded.model, loading.windows_to_test(loaded, data_set, whole=False)
+    model, windows = loaded.model, loading.windows_to_test(loaded, data_set, whole_sequences=False)
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     document: dict[str, Any] = {}
     path = out or run / f"{loading.record('calibration', loaded, data_set)}.json"
@@ -271,16 +271,16 @@ def coverage(
     )
 
 
-def _calibration_and_test(loaded: runs.Loaded, data_set: Any, label: str | None, values: Sequence[str]) -> Any:
+def _calibration_and_test(run: runs.Loaded, data_set: Any, label: str | None, values: Sequence[str]) -> Any:
     """Return the windows for calibration and for the test.
 
     Raises:
         UsageError: the label divides no test clips.
     """
-    if loaded.config.kind == "panel":
+    if run.config.kind == "panel":
         if label is not None:
-            raise UsageError(f"--label is for motion, and {loaded.path} was fitted on a table; leave it out")
-        return [tables.windows(loaded, data_set, split) for split in ("validation", "test")]
+            raise UsageError(f"--label is for motion, and {run.path} was fitted on a table; leave it out")
+        return [tables.windows(run, data_set, split) for split in ("validation", "test")]
     if label is None:
         return [data_set.windows(split) for split in ("validation", "test")]
     clips, motion_set = data_set.windows("test").clips, data_set.motion

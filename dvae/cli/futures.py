@@ -148,13 +148,11 @@ def forecast(
 
 
 def _follow_paths(
-    loaded: runs.Loaded, windows: motion.Windows, paths: Paths, samples: int, seed: int, out: Path, figure: Path | None
+    run: runs.Loaded, windows: motion.Windows, paths: Paths, samples: int, seed: int, out: Path, figure: Path | None
 ) -> None:
     """Draw motions along given paths, from the first pose of one window, and write them."""
-    if not isinstance(loaded.model, TrajectoryModel):
-        raise UsageError(
-            f"{loaded.path} is a fitted {loaded.method.name}, which takes no paths; fit a trajevae or cvae-rnn"
-        )
+    if not isinstance(run.model, TrajectoryModel):
+        raise UsageError(f"{run.path} is a fitted {run.method.name}, which takes no paths; fit a trajevae or cvae-rnn")
     if paths.exact and not (paths.joints or paths.paths):
         raise UsageError("--exact requires paths; give them with --joints or --paths")
     positions = windows.positions(windows.all().mask_to_nan()).numpy()
@@ -163,9 +161,7 @@ def _follow_paths(
     path_by_joint = _given_paths(joint_names(paths.joints), truth, paths.paths, windows.skeleton)
     options: dict[str, Any] = {"exact": paths.exact, "temperature": paths.temperature, "progress": True}
     with seeded(seed):
-        completion = loaded.model.complete(
-            pose, path_by_joint, None if path_by_joint else len(truth), samples, **options
-        )
+        completion = run.model.complete(pose, path_by_joint, None if path_by_joint else len(truth), samples, **options)
     before_and_after = pose[None, None], truth[None, : completion.positions.shape[1]]
     motions = motion.Forecasts(
         windows.skeleton, [windows.keys[index]], completion.positions[:, None], *before_and_after, "mean"
@@ -245,7 +241,7 @@ def impute(
     if out is None and filled is None:
         raise UsageError("impute writes a file; name it with --out or --filled")
     file_format = None if filled is None else format_of(filled, None if filled.suffix else "bvh")
-    windows, model = windows_of(data_set, clip, whole=clip is not None), loaded.model
+    windows, model = windows_of(data_set, clip, whole_clip=clip is not None), loaded.model
     if filled is not None and filled.suffix and file_format != "npz" and len(windows.clips) > 1:
         raise UsageError(
             f"--filled {filled} can contain one of {len(windows.clips)} clips; name it with --clip, or end the file in "
@@ -385,9 +381,9 @@ def _play(out: Path, *motions: Any, **options: Any) -> None:
     animate(*motions, **options).save(out)
 
 
-def joint_names(given: Sequence[str]) -> list[str]:
+def joint_names(texts: Sequence[str]) -> list[str]:
     """Return names of joints that are separated by commas or blanks."""
-    return [name for text in given for name in text.replace(",", " ").split()]
+    return [name for text in texts for name in text.replace(",", " ").split()]
 
 
 def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
@@ -403,26 +399,26 @@ def _clip(clips: motion.MotionSet, name: str) -> motion.Clip:
     return matches[0]
 
 
-def windows_of(opened: Any, clip: str | None, whole: bool = False) -> motion.Windows:
+def windows_of(data_set: Any, clip: str | None, whole_clip: bool = False) -> motion.Windows:
     """Return the test windows of data.
 
     Args:
-        opened: data of a run, or other data.
+        data_set: data of a run, or other data.
         clip: name of a clip of any split, whose windows are returned instead.
-        whole: whether to return the whole clip as one window.
+        whole_clip: whether to return the whole clip as one window.
     """
     if clip is None:
-        return opened.windows("test")  # type: ignore[no-any-return]
-    selected, motion_set = _clip(opened.motion, clip), opened.motion
-    subset = motion.MotionSet([selected], motion_set.skeleton, opened.path, missing=motion_set.missing)
-    protocol = replace(opened.protocol, split_by="split", test=tuple(subset.splits), train=())
-    return motion.windows(subset, protocol, "test", selected.frames if whole else None)
+        return data_set.windows("test")  # type: ignore[no-any-return]
+    selected, motion_set = _clip(data_set.motion, clip), data_set.motion
+    subset = motion.MotionSet([selected], motion_set.skeleton, data_set.path, missing=motion_set.missing)
+    protocol = replace(data_set.protocol, split_by="split", test=tuple(subset.splits), train=())
+    return motion.windows(subset, protocol, "test", selected.frames if whole_clip else None)
 
 
 def draw_futures(
-    loaded: runs.Loaded,
+    run: runs.Loaded,
     windows: motion.Windows,
-    chosen: Sequence[int],
+    indices: Sequence[int],
     samples: int,
     seed: int,
     horizon: int | None = None,
@@ -436,20 +432,20 @@ def draw_futures(
     Raises:
         UsageError: `fix` names something that the model cannot fix.
     """
-    model = loaded.model
+    model = run.model
     is_drawn = model.is_drawn(means=True) if draw_emission is None else draw_emission
     free = {*(model.view.parts or ()), *(name for name in model.latents if not model.generative.local(name))}
     if unknown := [name for name in fix if name not in free]:
         raise UsageError(
-            f"--fix {' '.join(unknown)}: {loaded.path} has "
+            f"--fix {' '.join(unknown)}: {run.path} has "
             + (f"{', '.join(sorted(free))} to fix" if free else "nothing to fix, no parts and no static latents")
         )
-    observed, horizon = loaded.schema.protocol.observed, horizon or loaded.schema.protocol.predicted
+    observed, horizon = run.schema.protocol.observed, horizon or run.schema.protocol.predicted
     keys = windows.keys
-    batch = windows.all().rows(list(chosen))
+    batch = windows.all().rows(list(indices))
     past, future = batch.past(observed), batch.mask_to_nan()[:, observed:][:, :horizon]
     with seeded(seed):
-        n_frames = max(horizon, loaded.schema.protocol.predicted) if fix else horizon  # a part is fixed at all frames
+        n_frames = max(horizon, run.schema.protocol.predicted) if fix else horizon  # a part is fixed at all frames
         parts = []
         for past_part in Sequences(past).batches(64):
             shared = model.forecast(past_part, n_frames, 1, draw_emission=is_drawn) if fix else {}
@@ -459,7 +455,7 @@ def draw_futures(
             del values  # with many samples, the largest object here
     observed_frames, truth = (windows.positions(x).numpy() for x in (past.mask_to_nan(), future))
     forecasts, emission = np.concatenate(parts, axis=1), "drawn" if is_drawn else "mean"
-    return motion.Forecasts(windows.skeleton, [keys[n] for n in chosen], forecasts, observed_frames, truth, emission)
+    return motion.Forecasts(windows.skeleton, [keys[n] for n in indices], forecasts, observed_frames, truth, emission)
 
 
 def _in_world(futures: motion.Forecasts, windows: motion.Windows, indices: Sequence[int]) -> motion.Forecasts:

@@ -24,20 +24,20 @@ Expert = Annotated[T, EXPERT]
 
 
 def command_stub(
-    function: Callable[..., None], given: Sequence[str], everything: bool
+    function: Callable[..., None], arguments: Sequence[str], everything: bool
 ) -> tuple[Callable[..., None], str]:
     """Return a function that has a command's signature, for its help, and " METHOD" if a method is given.
 
     Args:
         function: function of the command.
-        given: arguments, which may name a method to fit.
+        arguments: arguments of the command, which may name a method to fit.
         everything: whether to show expert options.
     """
     from ..models.registry import methods, metric_models
 
     hints = get_type_hints(function, include_extras=True)
     known: dict[str, type[Trainable]] = {**methods(), **metric_models()} if function.__name__ == "fit" else {}
-    kind = next((known[word] for word in given if word in known), None)
+    kind = next((known[word] for word in arguments if word in known), None)
     if known and kind is None:
         _list_methods(known)
     training_defaults = dict.fromkeys((option.name for option in fields(Training)), "default: the method's")
@@ -147,10 +147,10 @@ def _by_preset(values: Mapping[str, Any]) -> str:
     return "default: " + ", ".join(f"{value} ({name or 'other data'})" for name, value in descriptions.items())
 
 
-def _list_methods(known: Mapping[str, type[Trainable]]) -> None:
+def _list_methods(trainables: Mapping[str, type[Trainable]]) -> None:
     """Print the methods by group, one line each."""
     groups: dict[str, list[type[Trainable]]] = {}
-    for kind in known.values():
+    for kind in trainables.values():
         groups.setdefault(_group(kind), []).append(kind)
     OUT.print("usage: dvae fit METHOD --out RUN [options]; `dvae fit METHOD --help` shows the options of a method.\n")
     for group, kinds in groups.items():

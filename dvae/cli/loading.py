@@ -107,23 +107,24 @@ def data_of(path: str | None, *shared: runs.Loaded, missing: bool = False) -> An
     return other_data
 
 
-def windows_to_test(loaded: runs.Loaded, opened: Any, stride: int | None = None, whole: bool = True) -> Any:
+def windows_to_test(run: runs.Loaded, data_set: Any, stride: int | None = None, whole_sequences: bool = True) -> Any:
     """Return the test windows of data, cut as in a run.
 
     Args:
-        loaded: run.
-        opened: its data, or other data.
+        run: fitted run.
+        data_set: data of the run, or other data.
         stride: steps between the starts of windows, in place of the run's.
-        whole: whether to return whole sequences of a table, which have no forecasts, if the run was fitted on them.
+        whole_sequences: whether to return whole sequences of a table, which have no forecasts, if the run was fitted
+            on them.
     """
-    if loaded.config.kind == "panel":
-        if not whole or opened.schema.cut.length is not None:
-            return tables.windows(loaded, opened, stride=stride)
+    if run.config.kind == "panel":
+        if not whole_sequences or data_set.schema.cut.length is not None:
+            return tables.windows(run, data_set, stride=stride)
         if stride is not None:
-            raise UsageError(f"--stride is for windows, and {loaded.path} was fitted on whole sequences; leave it out")
-        return opened.windows("test")
-    protocol = opened.protocol if stride is None else replace(opened.protocol, test_stride=stride)
-    return motion.windows(opened.motion, protocol, "test")
+            raise UsageError(f"--stride is for windows, and {run.path} was fitted on whole sequences; leave it out")
+        return data_set.windows("test")
+    protocol = data_set.protocol if stride is None else replace(data_set.protocol, test_stride=stride)
+    return motion.windows(data_set.motion, protocol, "test")
 
 
 def forecaster(path: Path, data: str | None, missing: bool = False, failed: bool = False) -> tuple[runs.Loaded, Any]:
@@ -163,17 +164,17 @@ def _cut(run: runs.Loaded) -> str:
     return str(run.config.data.cut if run.config.kind == "segments" else run.schema.protocol.name)
 
 
-def is_training_data(run: runs.Loaded, opened: Any) -> bool:
+def is_training_data(run: runs.Loaded, data_set: Any) -> bool:
     """Return whether a run was fitted on these data."""
-    return bool(opened.fingerprint == run.config.data.fingerprint)
+    return bool(data_set.fingerprint == run.config.data.fingerprint)
 
 
-def record(kind: str, run: runs.Loaded, opened: Any) -> str:
+def record(kind: str, run: runs.Loaded, data_set: Any) -> str:
     """Return the file name of a record of a run, without suffix; it contains the name of other data."""
-    return kind if is_training_data(run, opened) else f"{kind}-{Path(opened.location).stem}"
+    return kind if is_training_data(run, data_set) else f"{kind}-{Path(data_set.location).stem}"
 
 
-def rows(loaded: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
+def rows(loaded_runs: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     """Group runs that differ only in the training seed.
 
     Returns:
@@ -185,7 +186,7 @@ def rows(loaded: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     """
     rows: dict[str, list[runs.Loaded]] = {}
     seeds: dict[tuple[str, int], Path] = {}
-    for run in loaded:
+    for run in loaded_runs:
         key = json.dumps(config_without_seed(run), sort_keys=True)
         seed = run.config.training.seed
         if (key, seed) in seeds:
@@ -211,16 +212,20 @@ def _sweep_name(row: Sequence[runs.Loaded]) -> str:
     return stems.pop() if len(stems) == 1 and len(row) > 1 else ""
 
 
-def _distinct_labels(loaded: Sequence[runs.Loaded]) -> list[str]:
+def _distinct_labels(loaded_runs: Sequence[runs.Loaded]) -> list[str]:
     """Return labels that distinguish runs of one method: options, or directory names, or whole paths."""
-    options = [_options(run) for run in loaded]
+    options = [_options(run) for run in loaded_runs]
     keys = dict.fromkeys(key for run_options in options for key in run_options)
     differing = [key for key in keys if len({str(run_options.get(key)) for run_options in options}) > 1]
     option_labels = [
         ", ".join(f"{key.partition('.')[2]} {run_options[key]}" for key in differing if key in run_options)
         for run_options in options
     ]
-    candidates = (option_labels, [run.path.absolute().name for run in loaded], [str(run.path) for run in loaded])
+    candidates = (
+        option_labels,
+        [run.path.absolute().name for run in loaded_runs],
+        [str(run.path) for run in loaded_runs],
+    )
     return next(texts for texts in candidates if all(texts) and len(set(texts)) == len(texts))
 
 
@@ -239,8 +244,8 @@ def config_without_seed(run: runs.Loaded) -> dict[str, Any]:
     return {**config, "training": training, "data": {k: v for k, v in config["data"].items() if k != "path"}}
 
 
-def names(loaded: Sequence[runs.Loaded]) -> list[str]:
+def names(loaded_runs: Sequence[runs.Loaded]) -> list[str]:
     """Return method names; directory names if methods repeat, and whole paths if these repeat too."""
-    candidates = ([run.method.name for run in loaded], [run.path.name for run in loaded])
-    paths = [str(run.path) for run in loaded]
+    candidates = ([run.method.name for run in loaded_runs], [run.path.name for run in loaded_runs])
+    paths = [str(run.path) for run in loaded_runs]
     return next((names for names in candidates if len(set(names)) == len(names)), paths)

@@ -167,10 +167,10 @@ class Recovery:
         OUT.print(recovered.table())
 
 
-def _known_data(loaded: runs.Loaded, data: str | None) -> Any:
+def _known_data(run: runs.Loaded, data: str | None) -> Any:
     """Return the data of a run, or other data; None if the data are no longer available."""
     try:
-        return loading.data_of(data, loaded)
+        return loading.data_of(data, run)
     except CheckpointError as error:
         note(f"no known segments: the prior is N(0, I), and the search starts from this prior only: {error}")
         return None

@@ -92,29 +92,29 @@ def is_table(path: str) -> bool:
     return not of_motion and ("x" in entries or len(entries) == 1)
 
 
-def windows(loaded: runs.Loaded, opened: PanelData, split: str = "test", **cut: int | None) -> PanelWindows:
+def windows(run: runs.Loaded, data_set: PanelData, split: str = "test", **cut: int | None) -> PanelWindows:
     """Return windows to forecast, cut as in the run.
 
     Args:
-        loaded: run.
-        opened: its data, or other data.
+        run: fitted run.
+        data_set: data of the run, or other data.
         split: split of the windows.
         **cut: options of `Cut` that replace the values of the run, if not None.
 
     Raises:
         UsageError: the run was fitted on whole sequences, which have no forecasts.
     """
-    if opened.schema.cut.length is None:
+    if data_set.schema.cut.length is None:
         raise UsageError(
-            f"{loaded.path} was fitted on whole sequences; fit with --observed and --horizon to forecast, or compare "
+            f"{run.path} was fitted on whole sequences; fit with --observed and --horizon to forecast, or compare "
             "bounds with `dvae compare`"
         )
-    return opened.recut(**{name: steps for name, steps in cut.items() if steps is not None}).windows(split)
+    return data_set.recut(**{name: steps for name, steps in cut.items() if steps is not None}).windows(split)
 
 
 def forecast(
-    loaded: runs.Loaded,
-    opened: PanelData,
+    run: runs.Loaded,
+    data_set: PanelData,
     out: Path,
     sequence: str | None,
     horizon: int | None,
@@ -125,11 +125,11 @@ def forecast(
 ) -> None:
     """Forecast the test windows, the windows of one sequence, or the steps after the end of the table."""
     check_files(out, figure, *FORMATS)
-    opened = opened if sequence is None else opened.only([sequence])
+    data_set = data_set if sequence is None else data_set.only([sequence])
     samples = samples or SAMPLES
     split = "test" if sequence is None else "all"
-    selected = opened.ahead(horizon) if beyond else windows(loaded, opened, split, horizon=horizon)
-    forecasts = selected.forecast(loaded.model, samples, seed)
+    selected = data_set.ahead(horizon) if beyond else windows(run, data_set, split, horizon=horizon)
+    forecasts = selected.forecast(run.model, samples, seed)
     forecasts.save(out)
     ERROR.print(
         f"wrote {out}: {samples} futures of {forecasts.draws.shape[2]} steps for each of {len(forecasts.keys)} windows"
@@ -139,12 +139,12 @@ def forecast(
         save_figure(forecasts.plot(), figure)
 
 
-def impute(loaded: runs.Loaded, opened: PanelData, out: Path, samples: int | None, particles: int, seed: int) -> None:
+def impute(run: runs.Loaded, data_set: PanelData, out: Path, samples: int | None, particles: int, seed: int) -> None:
     """Draw the missing entries of a table, and write them."""
     check_files(out, None, *FORMATS)
-    samples, sequences = samples or SAMPLES, opened.whole()
+    samples, sequences = samples or SAMPLES, data_set.whole()
     with arguments():
-        imputed = sequences.impute(loaded.model, samples, seed, particles)
+        imputed = sequences.impute(run.model, samples, seed, particles)
     imputed.save(out)
     ERROR.print(f"wrote {out}: {samples} fillings of {imputed.missing.sum()} missing entries of {sequences.panel.name}")
     _note_omitted(samples, out)
@@ -160,12 +160,12 @@ def _note_omitted(samples: int, out: Path, figure: Path | None = None) -> None:
         note(f"left out at --samples {samples} (draws needed in brackets): {', '.join(omitted)}")
 
 
-def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
+def info(paths: Sequence[str], out: Path | None, options: ColumnOptions) -> None:
     """Print a summary of each table and a schema to edit; columns without a given role are guessed."""
     if out is not None and len(paths) > 1:
         raise UsageError(f"--out writes the schema of one table, got {len(paths)} tables; name one")
     for path in paths:
-        data_set = PanelData.open(path, **told.given())
+        data_set = PanelData.open(path, **options.given())
         panel = data_set.panel
         table = Table(title=f"{path}: {panel!r}")
         for name in ("column", "role", "family", "unit", "known", "smallest", "mean", "largest"):
@@ -180,7 +180,7 @@ def info(paths: Sequence[str], out: Path | None, told: ColumnOptions) -> None:
                 cells = [f"{number:.4g}" if summary.count[index] else "–" for number in numbers]
             table.add_row(column.name, column.role, column.family, column.unit, share, *cells)
         OUT.print(table)
-        if panel.columns.id and not told.given().get("id") and schema_beside(path) == (None, None):
+        if panel.columns.id and not options.given().get("id") and schema_beside(path) == (None, None):
             OUT.print(
                 f"note: each value of {', '.join(panel.columns.id)} is read as a separate sequence, as its name or its "
                 "repeated times suggest; if all rows are one sequence, make it part of the time",

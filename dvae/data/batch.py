@@ -59,14 +59,14 @@ class Batch(dict[str, Any]):
         """Whether some entries may be missing or padding."""
         return "lengths" in self or "mask" in self
 
-    def masks(self, whole: str = WHOLE) -> dict[str, Any]:
+    def masks(self, name: str = WHOLE) -> dict[str, Any]:
         """Return the masks as a dictionary from variable name to mask.
 
         Args:
-            whole: name of the variable to which the mask applies if the batch has a single mask instead of a mapping.
+            name: name of the variable to which the mask applies if the batch has a single mask instead of a mapping.
         """
         mask = self.get("mask", {})
-        return dict(mask) if isinstance(mask, Mapping) else {whole: mask}
+        return dict(mask) if isinstance(mask, Mapping) else {name: mask}
 
     def mask(self, name: str = WHOLE) -> Any:
         """Return a variable's mask, in the shape of its values: True where an entry was observed; None if all were."""
@@ -83,9 +83,9 @@ class Batch(dict[str, Any]):
         """Return the batch with `change` applied to every tensor."""
         return Batch({n: Batch(v).map(change) if isinstance(v, Mapping) else change(v) for n, v in self.items()})
 
-    def rows(self, which: Any) -> Batch:
+    def rows(self, index: Any) -> Batch:
         """Return some of the sequences, by a slice or an index."""
-        selected = self.map(lambda value: value[which])
+        selected = self.map(lambda value: value[index])
         selected.reader = self.reader
         return selected
 

@@ -45,19 +45,19 @@ def row_blocks(arrays: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         yield np.concatenate(parts)
 
 
-def cut_windows(arrays: Sequence[np.ndarray], which: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
+def cut_windows(arrays: Sequence[np.ndarray], indices: Tensor, starts: Tensor, lengths: Tensor | int) -> Tensor:
     """Return windows (B, T, ...) of arrays (N, ...), copied to a floating type that represents all their values.
 
     Args:
         arrays: arrays with rows of one shape.
-        which: (B,) index of each window's array.
+        indices: (B,) index of each window's array.
         starts: (B,) first row of each window in its array.
         lengths: (B,) number of rows of each window, or one number for all; shorter windows repeat their last row.
     """
-    steps = [lengths] * len(which) if isinstance(lengths, int) else lengths.tolist()
+    steps = [lengths] * len(indices) if isinstance(lengths, int) else lengths.tolist()
     dtype = np.result_type(np.float32, *{values.dtype for values in arrays})
-    windows = np.empty((len(which), max(steps, default=0), *arrays[0].shape[1:]), dtype)
-    for window, index, start, length in zip(windows, which.tolist(), starts.tolist(), steps, strict=True):
+    windows = np.empty((len(indices), max(steps, default=0), *arrays[0].shape[1:]), dtype)
+    for window, index, start, length in zip(windows, indices.tolist(), starts.tolist(), steps, strict=True):
         window[:length] = arrays[index][start : start + length]
         window[length:] = window[length - 1]
     return torch.from_numpy(windows)

@@ -33,20 +33,20 @@ class NpyError(ValueError):
     """Error for a file that is damaged or contains something other than plain data."""
 
 
-def header(read: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any]:
+def header(read_bytes: Callable[[int], bytes]) -> tuple[np.dtype, tuple[int, ...], Any]:
     """Return dtype, shape and order of an npy file, without evaluating its header as code.
 
     Args:
-        read: function that returns the next n bytes of the file, or the remaining ones.
+        read_bytes: function that returns the next n bytes of the file, or the remaining ones.
 
     Raises:
         NpyError: if this is not an npy file, or its header differs from those that NumPy writes for plain arrays.
     """
-    magic = read(8)
+    magic = read_bytes(8)
     if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\x00", b"\x02\x00"):
         raise NpyError(f"not an npy file of version 1 or 2 (it begins with {magic!r}); write it with numpy")
-    size = int.from_bytes(read(2 if magic[6] == 1 else 4), "little")
-    text = read(size).decode("latin1") if size <= LONGEST else ""
+    size = int.from_bytes(read_bytes(2 if magic[6] == 1 else 4), "little")
+    text = read_bytes(size).decode("latin1") if size <= LONGEST else ""
     match = HEADER.fullmatch(text)
     if not match or None in match.groups():
         raise NpyError(f"damaged, or not a plain array: the header of its npy file is {text[:100]!r}")

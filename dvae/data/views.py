@@ -71,13 +71,14 @@ class View:
         """
         return data
 
-    def inverse(self, seen: Batch) -> Batch:
+    def inverse(self, model_values: Batch) -> Batch:
         """Map values from the model's representation back to the data.
 
         Args:
-            seen: values (..., B, T, D) by name, and the values (B, ...) that the view added.
+            model_values: values (..., B, T, D) by name in the model's representation, and the values (B, ...) that the
+                view added.
         """
-        return seen
+        return model_values
 
     def log_det(self, data: Batch) -> Tensor:
         """Return the log absolute determinant of the Jacobian, (B,); 0 for a view that keeps volume.
@@ -130,8 +131,8 @@ class ContextView(View):
     names: tuple[str, ...] = ()
 
     @override
-    def inverse(self, seen: Batch) -> Batch:
-        return Batch({name: value for name, value in seen.items() if name not in self.names})
+    def inverse(self, model_values: Batch) -> Batch:
+        return Batch({name: value for name, value in model_values.items() if name not in self.names})
 
 
 class Views(View):
@@ -170,10 +171,10 @@ class Views(View):
         return data
 
     @override
-    def inverse(self, seen: Batch) -> Batch:
+    def inverse(self, model_values: Batch) -> Batch:
         for view in reversed(self.views):
-            seen = Batch(view.inverse(seen))
-        return seen
+            model_values = Batch(view.inverse(model_values))
+        return model_values
 
     @override
     def log_det(self, data: Batch) -> Tensor:
@@ -238,12 +239,12 @@ class Parts(View):
         return result | {"mask": masks} if mask is not None else result
 
     @override
-    def inverse(self, seen: Batch) -> Batch:
-        if not self.parts.keys() <= seen.keys():
-            return seen
+    def inverse(self, model_values: Batch) -> Batch:
+        if not self.parts.keys() <= model_values.keys():
+            return model_values
         order = [coordinate for part in self.parts.values() for coordinate in part]
-        x = torch.cat([seen[name] for name in self.parts], dim=-1)
-        return seen | {WHOLE: x.index_select(-1, indices(map(order.index, range(len(order))), x))}
+        x = torch.cat([model_values[name] for name in self.parts], dim=-1)
+        return model_values | {WHOLE: x.index_select(-1, indices(map(order.index, range(len(order))), x))}
 
 
 @dataclass(frozen=True)
@@ -336,8 +337,8 @@ class Past(View):
         return result
 
     @override
-    def inverse(self, seen: Batch) -> Batch:
-        if self.name not in seen:
-            return seen
-        first = seen[self.name].unflatten(-1, (self.frames, -1))
-        return seen | {WHOLE: torch.cat([first, seen[WHOLE]], -2) if WHOLE in seen else first}
+    def inverse(self, model_values: Batch) -> Batch:
+        if self.name not in model_values:
+            return model_values
+        first = model_values[self.name].unflatten(-1, (self.frames, -1))
+        return model_values | {WHOLE: torch.cat([first, model_values[WHOLE]], -2) if WHOLE in model_values else first}

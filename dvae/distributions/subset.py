@@ -62,8 +62,8 @@ class SubsetDistribution(TorchDistribution):
 
     Args:
         size: L, number of indices.
-        chosen: number of ones.
-        swapped: number of ones that are not among the first `chosen` indices; None for any number.
+        ones: number of ones.
+        swapped: number of ones that are not among the first `ones` indices; None for any number.
 
     Raises:
         ValueError: there are no vectors with these numbers of ones.
@@ -72,35 +72,35 @@ class SubsetDistribution(TorchDistribution):
     arg_constraints: ClassVar[dict[str, Any]] = {}
     support = constraints.independent(constraints.boolean, 1)
 
-    def __init__(self, size: int, chosen: int, swapped: int | None = None) -> None:
-        if not 0 <= chosen <= size or not 0 <= (swapped or 0) <= min(chosen, size - chosen):
+    def __init__(self, size: int, ones: int, swapped: int | None = None) -> None:
+        if not 0 <= ones <= size or not 0 <= (swapped or 0) <= min(ones, size - ones):
             raise ValueError(
-                "`chosen` must be from 0 to `size`, and `swapped` from 0 to min(chosen, size - chosen); "
-                f"got size={size}, chosen={chosen}, swapped={swapped}"
+                "`ones` must be from 0 to `size`, and `swapped` from 0 to min(ones, size - ones); "
+                f"got size={size}, ones={ones}, swapped={swapped}"
             )
-        self.size, self.chosen, self.swapped = size, chosen, swapped
+        self.size, self.ones, self.swapped = size, ones, swapped
         super().__init__(torch.Size(), torch.Size([size]), validate_args=False)
 
     @lazy_property
     def _log_number(self) -> float:
         """Natural logarithm of the number of possible subsets."""
         if self.swapped is None:
-            return _log_choose(self.size, self.chosen)
-        return _log_choose(self.chosen, self.swapped) + _log_choose(self.size - self.chosen, self.swapped)
+            return _log_choose(self.size, self.ones)
+        return _log_choose(self.ones, self.swapped) + _log_choose(self.size - self.ones, self.swapped)
 
     @override
     def sample(self, sample_shape: Any = ()) -> Tensor:
         shape = torch.Size(sample_shape)
         if self.swapped is None:
-            return _random_subset(shape, self.size, self.chosen)
-        first = 1 - _random_subset(shape, self.chosen, self.swapped)
-        return torch.cat([first, _random_subset(shape, self.size - self.chosen, self.swapped)], -1)
+            return _random_subset(shape, self.size, self.ones)
+        first = 1 - _random_subset(shape, self.ones, self.swapped)
+        return torch.cat([first, _random_subset(shape, self.size - self.ones, self.swapped)], -1)
 
     @override
     def log_prob(self, value: Tensor) -> Tensor:
-        valid = ((value == 0) | (value == 1)).all(-1) & (value.sum(-1) == self.chosen)
+        valid = ((value == 0) | (value == 1)).all(-1) & (value.sum(-1) == self.ones)
         if self.swapped is not None:
-            valid &= value[..., self.chosen :].sum(-1) == self.swapped
+            valid &= value[..., self.ones :].sum(-1) == self.swapped
         return torch.where(valid, -self._log_number, -torch.inf).to(value.dtype)
 
 

@@ -46,18 +46,18 @@ class MarkovBoundaries:
         self.parents = [self._to_bits(dag.pred[node]) for node in self.nodes]
         self.children = [self._to_bits(dag.succ[node]) for node in self.nodes]
 
-    def of(self, node: Node, given: AbstractSet[Node]) -> set[Node]:
+    def of(self, node: Node, conditioning_set: AbstractSet[Node]) -> set[Node]:
         """Return the Markov boundary of a node.
 
-        It is the smallest subset of `given` that makes the node independent of the rest of `given`. It contains a given
-        node u exactly if the other given nodes do not d-separate `node` from u. All nodes that are not given are
-        integrated out.
+        It is the smallest subset of the conditioning set that makes the node independent of the rest of this set. It
+        contains a given node u exactly if the other given nodes do not d-separate `node` from u. All nodes that are not
+        given are integrated out.
 
         Args:
-            node: a node that is not in `given`.
-            given: nodes whose values are known.
+            node: a node that is not in `conditioning_set`.
+            conditioning_set: nodes whose values are known.
         """
-        start, given_bits = self.bits[node], self._to_bits(given)
+        start, given_bits = self.bits[node], self._to_bits(conditioning_set)
         ancestors = frontier = start | given_bits
         while frontier:
             parents = 0

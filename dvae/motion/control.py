@@ -42,7 +42,7 @@ def follow_paths(
     latents: Tensor,
     scale: Tensor,
     paths: Tensor,
-    known: Tensor,
+    mask: Tensor,
     skeleton: Skeleton,
     bones: Tensor,
     *,
@@ -56,7 +56,7 @@ def follow_paths(
         latents: (S, ...) draws z_k, from which the fits of S motions start.
         scale: positive scale s of the latents under the prior; broadcasts against the latents of one motion.
         paths: (T, D) joint positions to follow, in metres.
-        known: (T, D), 1 where a path is known and 0 where `paths` is ignored.
+        mask: (T, D), 1 where a path is known and 0 where `paths` is ignored.
         skeleton: skeleton of the poses.
         bones: (J - 1,) target bone lengths in metres, in the order of `Skeleton.edges`; bones of length zero are
             unconstrained.
@@ -71,9 +71,9 @@ def follow_paths(
     """
     if steps < 1:
         raise ValueError(f"`steps` must be at least 1, got {steps}")
-    covariance = smooth_covariance(len(known))
+    covariance = smooth_covariance(len(mask))
     root = CORRECTION * torch.linalg.cholesky(covariance)
-    root, white, gain = (matrix.to(latents) for matrix in (root, torch.linalg.inv(root), gains(covariance, known)))
+    root, white, gain = (matrix.to(latents) for matrix in (root, torch.linalg.inv(root), gains(covariance, mask)))
     constrained = bones > SHORTEST
 
     def fit(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,18 +124,18 @@ def smooth_covariance(frames: int) -> Tensor:
     return kernel[1:, 1:] - kernel[1:, :1] * kernel[:1, 1:]
 
 
-def gains(covariance: Tensor, known: Tensor) -> Tensor:
+def gains(covariance: Tensor, mask: Tensor) -> Tensor:
     """Return (D, T, T) matrices that map a process to its conditional mean.
 
-    The mean of coordinate d is conditioned on its values at the frames with known[:, d] = 1; its values at all other
+    The mean of coordinate d is conditioned on its values at the frames with mask[:, d] = 1; its values at all other
     frames are ignored.
 
     Args:
         covariance: (T, T) covariance of the process over frames.
-        known: (T, D), 1 where a coordinate is known and 0 elsewhere.
+        mask: (T, D), 1 where a coordinate is known and 0 elsewhere.
     """
-    matrices = covariance.new_zeros(known.shape[1], *covariance.shape)
-    patterns, pattern = known.bool().cpu().unique(dim=1, return_inverse=True)
+    matrices = covariance.new_zeros(mask.shape[1], *covariance.shape)
+    patterns, pattern = mask.bool().cpu().unique(dim=1, return_inverse=True)
     for n, observed in enumerate(patterns.T):
         gain = torch.zeros_like(covariance)
         gain[:, observed] = torch.linalg.solve(covariance[observed][:, observed], covariance[observed]).T

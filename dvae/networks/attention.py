@@ -310,16 +310,16 @@ class AttentionNetwork(Network):
         return bias.masked_fill(~valid_steps(lengths, length).repeat(1, len(parents))[:, None, None], -math.inf)
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        given = self.extractors.of(given, lengths)
-        known_points = {i: part(given[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in given}
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        parents = self.extractors.of(parents, lengths)
+        known_points = {i: part(parents[p.name], lag) for i, (p, lag) in enumerate(self.points) if p.name in parents}
         queries = self.point.hoist(known_points, batch, length) if self.point is not None else None
-        fixed = [p for p in self.ranged if p.name in given]
-        live = [p for p in self.ranged if p.name not in given]
+        fixed = [p for p in self.ranged if p.name in parents]
+        live = [p for p in self.ranged if p.name not in parents]
         columns, tokens, bias = self.columns(), self.origin.new_zeros(batch, 1, 1), self.origin.new_zeros(1, 1, 1)
         if self.ranged:
             first = self.start_token if columns is None else functional.pad(columns.new_ones(1), (len(columns) - 1, 0))
-            stored = [self.kept(parent.name, given[parent.name]) for parent in fixed]
+            stored = [self.kept(parent.name, parents[parent.name]) for parent in fixed]
             tokens = torch.cat([first.expand(batch, 1, -1), *stored], dim=1)
             bias = functional.pad(self.biases([*fixed, *live], length, lengths), (1, 0))
         return Attending(
@@ -340,10 +340,10 @@ class AttentionNetwork(Network):
         )
 
     @override
-    def step(self, state: Attending, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        drawn = self.extractors.drawn(state.extracted, drawn, state.lengths) if self.extractors else drawn
+    def step(self, state: Attending, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        samples = self.extractors.drawn(state.extracted, samples, state.lengths) if self.extractors else samples
         stream = self.origin.expand(state.batch, -1)
-        parts = each_at(drawn, state.points, t, stream)
+        parts = each_at(samples, state.points, t, stream)
         if state.queries is not None and self.point is not None:
             stream = stream + self.point.add(state.queries, t, parts)
         if self.layers:
@@ -351,7 +351,7 @@ class AttentionNetwork(Network):
             for token in state.fresh(t):
                 i, s = divmod(token, state.length)
                 name = state.live[i].name
-                fresh.append(self.kept(name, drawn[name][s]))
+                fresh.append(self.kept(name, samples[name][s]))
             if fresh:
                 state.cache.append(fresh)
             bias = state.row(t)
@@ -361,9 +361,9 @@ class AttentionNetwork(Network):
 
     @override
     def forward_last(
-        self, state: Attending, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+        self, state: Attending, t: int, count: int, samples: Mapping[str, Sequence[Tensor]]
     ) -> tuple[Tensor, Any]:
-        return self.step(state, t + count - 1, drawn)  # `step` also adds all skipped tokens to the cache
+        return self.step(state, t + count - 1, samples)  # `step` also adds all skipped tokens to the cache
 
 
 class SelfAttentionNetwork(Network):
@@ -428,24 +428,26 @@ class SelfAttentionNetwork(Network):
         return (-self.slopes[:, None, None] * distance).masked_fill(~mask, -math.inf)[None]
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        if missing := [p.name for p in (*self.encoded, *self.statics) if p.name not in given]:
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        if missing := [p.name for p in (*self.encoded, *self.statics) if p.name not in parents]:
             raise ValueError(
                 f"SelfAttention encodes all frames at once, but {missing[0]} would be drawn step by step; use "
                 "networks.Attention for this factor"
             )
-        encoded = self.encode(given, length, lengths)
+        encoded = self.encode(parents, length, lengths)
         if self.after is None:
             return encoded.unbind(1)
-        return self.after.start({ENCODED: encoded, **given}, batch, length, lengths)
+        return self.after.start({ENCODED: encoded, **parents}, batch, length, lengths)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        return (state[t], state) if self.after is None else self.after.step(state, t, drawn)
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        return (state[t], state) if self.after is None else self.after.step(state, t, samples)
 
     @override
-    def forward_last(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        return self.step(state, t + count - 1, drawn)
+    def forward_last(
+        self, state: Any, t: int, count: int, samples: Mapping[str, Sequence[Tensor]]
+    ) -> tuple[Tensor, Any]:
+        return self.step(state, t + count - 1, samples)
 
 
 ENCODED = "encoded frame"

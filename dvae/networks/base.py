@@ -82,28 +82,28 @@ class Network(nn.Module):
         """
         raise NotImplementedError
 
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """Return the state before the first step of a loop, with all computations on the `given` parents done.
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """Return the state before the first step of a loop, with all computations on the known `parents` done.
 
         Args:
-            given: {name: values (B, T, D) or (B, D)} of the parents that the loop does not draw.
+            parents: {name: values (B, T, D) or (B, D)} of the parents that the loop does not draw.
             batch, length: B and T.
             lengths: as in `forward`.
         """
         raise NotImplementedError
 
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         """Return the features (B, H) at step t (counted from 0) and the next state.
 
         Args:
             state: state from `start` or the previous `step`. A loop calls `step` once for each step, in its order.
             t: the step.
-            drawn: {name: list with the values (B, D) of each step} of the parents that the loop draws.
+            samples: {name: list with the values (B, D) of each step} of the parents that the loop draws.
         """
         raise NotImplementedError
 
     def forward_chunk(
-        self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+        self, state: Any, t: int, count: int, samples: Mapping[str, Sequence[Tensor]]
     ) -> tuple[Tensor, Any]:
         """Return the features (B, N, H) at the steps t to t + N - 1, and the next state.
 
@@ -111,21 +111,23 @@ class Network(nn.Module):
         can evaluate the steps at once.
 
         Args:
-            state, t, drawn: as in `step`; `drawn` may already contain the draws of these steps.
+            state, t, samples: as in `step`; `samples` may already contain the draws of these steps.
             count: N, number of steps.
         """
         features = []
         for s in range(t, t + count):
-            output, state = self.step(state, s, drawn)
+            output, state = self.step(state, s, samples)
             features.append(output)
         return torch.stack(features, dim=1), state
 
-    def forward_last(self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def forward_last(
+        self, state: Any, t: int, count: int, samples: Mapping[str, Sequence[Tensor]]
+    ) -> tuple[Tensor, Any]:
         """Return the features (B, H) at the last of N steps, and the next state.
 
         The arguments are those of `forward_chunk`. Networks override the method if they can skip the earlier features.
         """
-        features, state = self.forward_chunk(state, t, count, drawn)
+        features, state = self.forward_chunk(state, t, count, samples)
         return features[:, -1], state
 
     def refuse_ragged(self, lengths: Tensor | None) -> None:
@@ -147,17 +149,17 @@ class FixedLengthNetwork(Network):
     """A network that computes the features of all steps at once; a loop must not draw any of its parents."""
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        if missing := [parent.name for parent in self.inputs if parent.name not in given]:
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        if missing := [parent.name for parent in self.inputs if parent.name not in parents]:
             name = type(self).__name__.removesuffix("Network")
             raise ValueError(
                 f"{name} computes all steps at once, but {', '.join(missing)} would be drawn step by step; use "
                 "another network for this factor"
             )
-        return self(given, length, lengths).unbind(1)
+        return self(parents, length, lengths).unbind(1)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         return state[t], state
 
 
@@ -311,28 +313,30 @@ class Join(nn.Module):
         parts = aligned(parts)
         return torch.stack(parts).mean(0) if self.mean else torch.cat(parts, dim=-1)
 
-    def hoist(self, known: Mapping[int, Tensor], batch: int, length: int, through: nn.Linear | None = None) -> Hoisted:
+    def hoist(
+        self, known_parts: Mapping[int, Tensor], batch: int, length: int, through: nn.Linear | None = None
+    ) -> Hoisted:
         """Return the known parts' contribution to the first layer at every step, and the weights of the live parts.
 
         Args:
-            known: {index of a part: values (B, T, D), or (B, D) for a static part}.
+            known_parts: {index of a part: values (B, T, D), or (B, D) for a static part}.
             batch, length: B and T.
             through: linear layer that serves as the first layer if the join has no layers.
         """
         layer = self.first or through
         if layer is None:
             empty = self.like.new_empty(batch, length, 0)
-            return Hoisted(torch.cat(aligned([empty, *known.values()]), dim=-1), [], known)
+            return Hoisted(torch.cat(aligned([empty, *known_parts.values()]), dim=-1), [], known_parts)
         if self.mean:
             weights = [layer.weight / len(self.sizes)] * len(self.sizes)
         else:
             weights = list(layer.weight.split(self.sizes, dim=1))
         base = layer.bias.expand(batch, length, -1)
-        if known:
-            matrix = torch.cat([weights[i] for i in known], dim=1)
-            base = functional.linear(torch.cat(aligned(list(known.values())), dim=-1), matrix, layer.bias)
+        if known_parts:
+            matrix = torch.cat([weights[i] for i in known_parts], dim=1)
+            base = functional.linear(torch.cat(aligned(list(known_parts.values())), dim=-1), matrix, layer.bias)
             base = base if base.dim() == 3 else base[:, None].expand(-1, length, -1)
-        return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in known], known)
+        return Hoisted(base, [weight for i, weight in enumerate(weights) if i not in known_parts], known_parts)
 
     def add(self, hoisted: Hoisted, t: int | slice, live: Sequence[Tensor]) -> Tensor:
         """Return the features (B, H) at step t, or (B, N, H) at several steps, from hoisted and live parts.

@@ -57,17 +57,19 @@ class Extractors(nn.ModuleDict):
         return {n: (getattr(m, "hoisted", lambda m=m: m)(), Rows([None] * length)) for n, m in self.items()}
 
     def drawn(
-        self, kept: Mapping[str, tuple[Any, Rows]], drawn: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
+        self, state: Mapping[str, tuple[Any, Rows]], samples: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
     ) -> dict[str, Sequence[Tensor]]:
         """Return the draws of a loop so far with extracted features in place of values; each draw is evaluated once.
 
         Args:
-            kept: result of `start`.
-            drawn: {name: list with the values (B, D) of each step} of the parents that the loop draws.
+            state: result of `start`.
+            samples: {name: list with the values (B, D) of each step} of the parents that the loop draws.
             lengths: (B,) number of valid steps of each sequence, or None.
         """
-        features = {n: extend_features(kept[n][1], drawn[n], self[n], lengths, kept[n][0]) for n in self.keys() & drawn}
-        return {**drawn, **features}
+        features = {
+            n: extend_features(state[n][1], samples[n], self[n], lengths, state[n][0]) for n in self.keys() & samples
+        }
+        return {**samples, **features}
 
 
 def share(name: str, *networks: Any) -> None:

@@ -94,16 +94,16 @@ class WithNoiseNetwork(Network):
         return torch.cat([features, self._scales(parents[self.name], length, lengths)], -1)
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        if self.name not in given:
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        if self.name not in parents:
             raise ValueError(f"the noise scale {self.name} cannot be drawn; give it as context in the batch")
-        scales = self._scales(given[self.name], length, lengths).unbind(1)
-        return self.inner.start(self._without_scale(given), batch, length, lengths), scales
+        scales = self._scales(parents[self.name], length, lengths).unbind(1)
+        return self.inner.start(self._without_scale(parents), batch, length, lengths), scales
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         inner, scales = state
-        features, inner = self.inner.step(inner, t, drawn)
+        features, inner = self.inner.step(inner, t, samples)
         return torch.cat([features, scales[t]], -1), (inner, scales)
 
     @override

@@ -72,12 +72,12 @@ class LinearNetwork(Network):
             return weight
         return weight * visible(relation, length, weight.device)[: len(weight), :, None, None]
 
-    def known(self, given: Mapping[str, Tensor], length: int) -> Tensor:
+    def known(self, parents: Mapping[str, Tensor], length: int) -> Tensor:
         """Return the bias plus the contribution of the given parents, (B, T, H), or (T, H) if no parent is given."""
         features: Tensor = self.bias[:length]
         for parent in self.inputs:
-            if parent.name in given:
-                values = given[parent.name]
+            if parent.name in parents:
+                values = parents[parent.name]
                 values = values[:, None] if parent.relation is None else values
                 features = features + torch.einsum("tshd,bsd->bth", self.weight(parent.name, length), values)
         return features
@@ -90,19 +90,19 @@ class LinearNetwork(Network):
         return features if self.local else features[:, 0]
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        base = self.known(given, length).expand(batch, -1, -1)
-        live = [parent.name for parent in self.inputs if parent.name not in given]
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        base = self.known(parents, length).expand(batch, -1, -1)
+        live = [parent.name for parent in self.inputs if parent.name not in parents]
         return base.unbind(1), {n: (self.weight(n, length), self.mask(n, length).tolist()) for n in live}
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         base, live = state
         features = base[t]
         for name, (weight, mask) in live.items():
             for s, is_visible in enumerate(mask[t]):
                 if is_visible:
-                    features = features + at(drawn[name], s, features, weight.shape[-1]) @ weight[t, s].t()
+                    features = features + at(samples[name], s, features, weight.shape[-1]) @ weight[t, s].t()
         return features, state
 
     @override

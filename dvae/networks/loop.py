@@ -163,12 +163,12 @@ def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:
     return values[t] if 0 <= t < len(values) else like.new_zeros(like.shape[0], size)
 
 
-def each_at(drawn: Mapping[str, Sequence[Tensor]], parents: Sequence[Any], t: int, like: Tensor) -> list[Tensor]:
+def each_at(samples: Mapping[str, Sequence[Tensor]], parents: Sequence[Any], t: int, like: Tensor) -> list[Tensor]:
     """Return the draws (B, D) at step t + lag for each pair (parent, lag) of a `base.Input` and its lag.
 
     Static parents, whose lag is None, are skipped.
     """
-    return [at(drawn[parent.name], t + lag, like, parent.size) for parent, lag in parents if lag is not None]
+    return [at(samples[parent.name], t + lag, like, parent.size) for parent, lag in parents if lag is not None]
 
 
 def stack_steps(values: Sequence[Tensor], t: int, count: int, like: Tensor, size: int) -> Tensor:
@@ -225,7 +225,7 @@ def memoize_valid(module: nn.Module, values: Tensor, lengths: Tensor | None) -> 
 
 def extend_features(
     rows: Rows,
-    drawn: Sequence[Any],
+    samples: Sequence[Any],
     module: nn.Module,
     lengths: Tensor | None,
     change: Callable[[Tensor], Tensor] | None = None,
@@ -236,16 +236,16 @@ def extend_features(
 
     Args:
         rows: output of each step, which is extended in place; None for a step without an output.
-        drawn: draw of each step; None for a step that is not drawn yet.
+        samples: draw of each step; None for a step that is not drawn yet.
         module, lengths: as in `memoize_valid`.
         change: version of the module for single steps, with computations shared by all steps already done; None for
             the module itself.
     """
-    draws = drawn.values if isinstance(drawn, Rows) else drawn
+    draws = samples.values if isinstance(samples, Rows) else samples
     fresh = [
         s for s, (feature, value) in enumerate(zip(rows.values, draws, strict=False)) if feature is None is not value
     ]
-    values = [drawn[s] for s in fresh]
+    values = [samples[s] for s in fresh]
 
     def compute() -> Sequence[Tensor]:
         return (

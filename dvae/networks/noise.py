@@ -181,8 +181,8 @@ class _Concatenated(nn.Module):
         super().__init__()
         self.block, self.last = Residual(size, width), last or nn.Identity()
 
-    def forward(self, past: Tensor, other: Tensor, indices: Tensor | None = None) -> Tensor:
-        features: Tensor = self.last(self.block(torch.cat([past, other], -1)))
+    def forward(self, past: Tensor, future_or_z: Tensor, indices: Tensor | None = None) -> Tensor:
+        features: Tensor = self.last(self.block(torch.cat([past, future_or_z], -1)))
         return features
 
 

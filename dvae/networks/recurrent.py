@@ -128,23 +128,23 @@ class Memory(nn.Module):
             states = layer(states)[0]
         return reverse(states, lengths) if self.direction < 0 else states
 
-    def start(self, given: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> MemoryState:
+    def start(self, parents: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> MemoryState:
         """Return the state before the first step, with the first layer already applied to the given parents.
 
         Args:
-            given: {name: features (B, T, D)} of the parents that the loop does not draw.
+            parents: {name: features (B, T, D)} of the parents that the loop does not draw.
             batch: B, number of sequences.
             lengths: (B,) number of valid steps of each sequence, or None.
         """
         first = self.embed[0] if self.embed is not None else self.layers[0]
         weight, bias = (first.weight, first.bias) if self.embed is not None else (first.weight_ih_l0, first.bias_ih_l0)
         columns = weight.split([parent.size for parent, _ in self.entries], dim=1)
-        known_entries = [i for i, (parent, _) in enumerate(self.entries) if parent.name in given]
+        known_entries = [i for i, (parent, _) in enumerate(self.entries) if parent.name in parents]
         live = [i for i in range(len(self.entries)) if i not in known_entries]
         base = bias.expand(batch, 1, -1)
         if known_entries:
             values = torch.cat(
-                [shift(given[self.entries[i][0].name], self.entries[i][1]) for i in known_entries], dim=-1
+                [shift(parents[self.entries[i][0].name], self.entries[i][1]) for i in known_entries], dim=-1
             )
             base = functional.linear(values, torch.cat([columns[i] for i in known_entries], dim=1), bias)
         zero = weight.new_zeros(batch, self.layers[0].hidden_size)
@@ -155,17 +155,17 @@ class Memory(nn.Module):
             hidden=[(zero, zero)] * len(self.layers),
         )
 
-    def step(self, state: MemoryState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
+    def step(self, state: MemoryState, t: int, samples: Mapping[str, Sequence[Tensor]]) -> Tensor:
         """Return the state (B, W) at step t; `state` is advanced in place.
 
         Args:
             state: state from `start`, after the steps before t in the order of the loop.
             t: the step, counted from 0.
-            drawn: {name: list with the features (B, D) of each step} of the parents that the loop draws.
+            samples: {name: list with the features (B, D) of each step} of the parents that the loop draws.
         """
         value = state.steps[t if len(state.steps) > 1 else 0]
         for parent, lag, weight in state.live:
-            value = torch.addmm(value, at(drawn[parent.name], t + lag, value, parent.size), weight)
+            value = torch.addmm(value, at(samples[parent.name], t + lag, value, parent.size), weight)
         if self.embed is not None:
             value = self.embed[1](value)
         valid = None if state.lengths is None or self.direction > 0 else (t < state.lengths)[:, None]
@@ -179,12 +179,12 @@ class Memory(nn.Module):
             value = new[0]
         return value
 
-    def forward_chunk(self, state: MemoryState, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]) -> Tensor:
+    def forward_chunk(self, state: MemoryState, t: int, count: int, samples: Mapping[str, Sequence[Tensor]]) -> Tensor:
         """Return the states (B, N, W) of a forward memory at N steps from t on; `state` is advanced in place."""
         if self.embed is None and len(state.live) < len(self.entries):  # part of its gates is known
-            return torch.stack([self.step(state, s, drawn) for s in range(t, t + count)], dim=1)
+            return torch.stack([self.step(state, s, samples) for s in range(t, t + count)], dim=1)
         like = state.hidden[0][0]
-        parts = [stack_steps(drawn[parent.name], t + lag, count, like, parent.size) for parent, lag, _ in state.live]
+        parts = [stack_steps(samples[parent.name], t + lag, count, like, parent.size) for parent, lag, _ in state.live]
         if self.embed is None:
             value = torch.cat(parts, dim=-1)
         else:
@@ -330,35 +330,35 @@ class RecurrentNetwork(Network):
         return features[:, None].expand(-1, length, -1) if self.local and features.dim() == 2 else features
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        values = self.extractors.of(given, lengths)
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        values = self.extractors.of(parents, lengths)
         known_parts: dict[int, Tensor] = {}
         memories: list[tuple[Memory, MemoryState]] = []
         for i, memory in enumerate(self.memories):
-            if all(parent.name in given for parent, _ in memory.entries):
-                known_parts[i] = memory(values, given, lengths)
+            if all(parent.name in parents for parent, _ in memory.entries):
+                known_parts[i] = memory(values, parents, lengths)
             else:
                 memories.append((memory, memory.start(values, batch, lengths)))
         live: list[tuple[Input, int]] = []
         for i, (parent, lag) in enumerate(self.points, len(self.memories)):
-            if parent.name in given:
+            if parent.name in parents:
                 known_parts[i] = part(values[parent.name], lag)
             elif lag is not None:
                 live.append((parent, lag))
         hoisted = self.join.hoist(known_parts, batch, length)
-        return RecurrentState(hoisted, memories, live, self.extractors.start(length), dict(given), lengths)
+        return RecurrentState(hoisted, memories, live, self.extractors.start(length), dict(parents), lengths)
 
     @override
-    def step(self, state: RecurrentState, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        values = self.extractors.drawn(state.extracted, drawn, state.lengths) if self.extractors else drawn
+    def step(self, state: RecurrentState, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        values = self.extractors.drawn(state.extracted, samples, state.lengths) if self.extractors else samples
         parts = [memory.step(memory_state, t, values) for memory, memory_state in state.memories]
         like = parts[0] if parts else state.hoisted.like
         parts += each_at(values, state.live, t, like) if state.live else []
         return self.join.add(state.hoisted, t, parts), state
 
     @override
-    def forward_chunk(self, state: RecurrentState, t: int, count: int, drawn: Any) -> tuple[Tensor, Any]:
-        values = self.extractors.drawn(state.extracted, drawn, state.lengths) if self.extractors else drawn
+    def forward_chunk(self, state: RecurrentState, t: int, count: int, samples: Any) -> tuple[Tensor, Any]:
+        values = self.extractors.drawn(state.extracted, samples, state.lengths) if self.extractors else samples
         parts = [memory.forward_chunk(memory_state, t, count, values) for memory, memory_state in state.memories]
         like = parts[0] if parts else state.hoisted.like
         parts += [stack_steps(values[parent.name], t + lag, count, like, parent.size) for parent, lag in state.live]

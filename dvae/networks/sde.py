@@ -173,25 +173,25 @@ class Equation(nn.Module):
 
         return memoize(self, [gaps, lengths], compute)
 
-    def over(self, gaps: Tensor, there: Tensor, name: str, first: int = 0) -> tuple[Tensor, Tensor]:
+    def over(self, gaps: Tensor, has_previous: Tensor, name: str, first: int = 0) -> tuple[Tensor, Tensor]:
         """Return F and the whitening matrix of Q, (B, T, D, D) each; equal gaps are computed once.
 
         Args:
             gaps: d, (B, T).
-            there: (B, T), False if there is no previous step and z follows its stationary distribution.
+            has_previous: (B, T), False if there is no previous step and z follows its stationary distribution.
             name: name of the gaps in error messages.
             first: number of the first of the T steps, counted from 0, for error messages.
 
         Raises:
             ValueError: a gap is not positive and finite.
         """
-        if (bad := there & ~((gaps > 0) & (gaps < math.inf))).any():
+        if (bad := has_previous & ~((gaps > 0) & (gaps < math.inf))).any():
             row, t = bad.nonzero()[0].tolist()
             raise ValueError(
                 f"{name} is {gaps[row, t]:g} at step {first + t} of sequence {row}, counted from 0; a gap, the time "
                 "since the previous step, must be positive and finite: merge values at one time into one step"
             )
-        distinct = gaps[there]
+        distinct = gaps[has_previous]
         positions = torch.arange(len(distinct), device=gaps.device)
         if not gaps.requires_grad:
             distinct, positions = distinct.unique(return_inverse=True)
@@ -207,7 +207,7 @@ class Equation(nn.Module):
                 ]
             )
         index = torch.full(gaps.shape, len(distinct), device=gaps.device)
-        index[there] = positions
+        index[has_previous] = positions
         return decay[index], whitening[index]
 
 
@@ -234,26 +234,26 @@ class LinearSDENetwork(Network):
         return _features(decay, None, whitening, shift(parents[self.before], -1))
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         transitions = None
-        if self.gap in given:
-            transitions = tuple(part.unbind(1) for part in self.equation.at_all(given[self.gap], lengths, self.gap))
-        return transitions, given[self.before].unbind(1) if self.before in given else None
+        if self.gap in parents:
+            transitions = tuple(part.unbind(1) for part in self.equation.at_all(parents[self.gap], lengths, self.gap))
+        return transitions, parents[self.before].unbind(1) if self.before in parents else None
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         transitions, previous = state
-        decay, whitening = self.drawn_over(t, drawn) if transitions is None else (part[t] for part in transitions)
-        return _features(decay, None, whitening, self._last(previous, t, drawn, decay)), state
+        decay, whitening = self.drawn_over(t, samples) if transitions is None else (part[t] for part in transitions)
+        return _features(decay, None, whitening, self._last(previous, t, samples, decay)), state
 
-    def drawn_over(self, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+    def drawn_over(self, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
         """Return F and the whitening matrix of Q, (B, D, D) each, at step t of a loop that draws the gaps."""
-        gaps = drawn[self.gap][t]
+        gaps = samples[self.gap][t]
         decay, whitening = self.equation.over(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), self.gap, t)
         return decay[:, 0], whitening[:, 0]
 
-    def _last(self, previous: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], like: Tensor) -> Tensor:
-        return at(drawn[self.before] if previous is None else previous, t - 1, like, self.size)
+    def _last(self, previous: Any, t: int, samples: Mapping[str, Sequence[Tensor]], like: Tensor) -> Tensor:
+        return at(samples[self.before] if previous is None else previous, t - 1, like, self.size)
 
 
 class LinearSDEGuideNetwork(LinearSDENetwork):
@@ -273,22 +273,22 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
         return _features(*self._at_all(parents, length, lengths), shift(parents[self.before], -1))
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        if all(parent.name in given for parent in self.potential.inputs):
-            transitions = tuple(part.unbind(1) for part in self._at_all(given, length, lengths))
-            return transitions, given[self.before].unbind(1) if self.before in given else None, None
-        others = {parent.name: given[parent.name] for parent in self.potential.inputs if parent.name in given}
-        return *super().start(given, batch, length, lengths), self.potential.start(others, batch, length, lengths)
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        if all(parent.name in parents for parent in self.potential.inputs):
+            transitions = tuple(part.unbind(1) for part in self._at_all(parents, length, lengths))
+            return transitions, parents[self.before].unbind(1) if self.before in parents else None, None
+        others = {parent.name: parents[parent.name] for parent in self.potential.inputs if parent.name in parents}
+        return *super().start(parents, batch, length, lengths), self.potential.start(others, batch, length, lengths)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         transitions, previous, potential = state
         if potential is None:
             decay, offset, whitening = (part[t] for part in transitions)
-            return _features(decay, offset, whitening, self._last(previous, t, drawn, decay)), state
-        decay, whitening = self.drawn_over(t, drawn) if transitions is None else (part[t] for part in transitions)
-        features, potential = self.potential.step(potential, t, drawn)
-        last = self._last(previous, t, drawn, decay)
+            return _features(decay, offset, whitening, self._last(previous, t, samples, decay)), state
+        decay, whitening = self.drawn_over(t, samples) if transitions is None else (part[t] for part in transitions)
+        features, potential = self.potential.step(potential, t, samples)
+        last = self._last(previous, t, samples, decay)
         return _features(*self.updated(decay, whitening, features), last), (transitions, previous, potential)
 
     @override
@@ -305,25 +305,25 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
         others = {parent.name: parents[parent.name] for parent in self.potential.inputs}
         return self.updated(decay, whitening, self.potential(others, length, lengths))
 
-    def updated(self, moved: Tensor, whitening: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def updated(self, decay: Tensor, whitening: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return M (..., D, D), c (..., D) and V (..., D, D) of q(z_t | z_{t-1}, ...) = N(M z_{t-1} + c, (V'V)^-1).
 
         With G = U'^-1 W, where U whitens Q, the only inverted matrix is I + G'G, which is close to I over short gaps.
 
         Args:
-            moved, whitening: F and U, (..., D, D) each.
+            decay, whitening: F and U, (..., D, D) each.
             features: (..., H) features of the network `potential`.
         """
-        with torch.autocast(moved.device.type, enabled=False):
-            observation, scale = self.out(features.to(moved)).split([self.size, self.size**2], dim=-1)
-            weight = scale.unflatten(-1, moved.shape[-2:])
+        with torch.autocast(decay.device.type, enabled=False):
+            observation, scale = self.out(features.to(decay)).split([self.size, self.size**2], dim=-1)
+            weight = scale.unflatten(-1, decay.shape[-2:])
             g = torch.linalg.solve_triangular(whitening.mT, weight, upper=True)
             identity = torch.eye(self.size, dtype=g.dtype, device=g.device)
             # lower triangular T with T'T = I + G G': Cholesky factor of the matrix with rows and columns reversed
             root = torch.linalg.cholesky((identity + g @ g.mT).flip(-1, -2)).flip(-1, -2).mT
             inner = torch.linalg.cholesky(identity + g.mT @ g)
             gain = torch.linalg.solve_triangular(whitening, torch.cholesky_solve(g.mT, inner).mT, upper=False)
-            return moved - gain @ (weight.mT @ moved), (gain @ observation[..., None])[..., 0], root @ whitening
+            return decay - gain @ (weight.mT @ decay), (gain @ observation[..., None])[..., 0], root @ whitening
 
 
 def _features(decay: Tensor, offset: Tensor | None, whitening: Tensor, before: Tensor) -> Tensor:

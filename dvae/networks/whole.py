@@ -117,13 +117,13 @@ class Trunk(nn.Module):
         self.out = nn.Linear((size, *spec.widths)[-1], spec.length * numbers)
         self.length = spec.length
 
-    def forward(self, given: Sequence[Tensor]) -> Tensor:
+    def forward(self, parents: Sequence[Tensor]) -> Tensor:
         """Return all steps of all variables, (B, N, D)."""
-        return self.made(self.features(given))
+        return self.made(self.features(parents))
 
-    def features(self, given: Sequence[Tensor]) -> Tensor:
+    def features(self, parents: Sequence[Tensor]) -> Tensor:
         """Return the features (B, H) that determine all steps."""
-        features: Tensor = self.hidden(torch.cat(list(given), -1))
+        features: Tensor = self.hidden(torch.cat(list(parents), -1))
         return features
 
     def made(self, features: Tensor, steps: Tensor | None = None, coordinates: slice = slice(None)) -> Tensor:

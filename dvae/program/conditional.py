@@ -287,37 +287,39 @@ class Conditional(nn.Module):
         offset = self.offset
         return value if offset is None else value + offset
 
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        """Return the initial state of a loop over time that draws the parents missing from `given`.
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        """Return the initial state of a loop over time that draws the parents that `parents` omits.
 
         Args:
-            given: values of the other parents by name, (B, T, D) or (B, D).
+            parents: values of the other parents by name, (B, T, D) or (B, D).
             batch: B.
             length: T.
             lengths: (B,) valid steps of a ragged batch.
         """
         if self.network is None:
-            return tuple(p.unbind(1) for p in self(given, batch, length))
-        state = self.network.start(self._read(given, batch, lengths), batch, length, lengths)
+            return tuple(p.unbind(1) for p in self(parents, batch, length))
+        state = self.network.start(self._read(parents, batch, lengths), batch, length, lengths)
         # these are read from the draws, even if given
         child = self.factor.child if self.head.residual and self._output_units is not None else None
-        live = [name for name in self.units if name in self.parents and (name not in given or name == child)]
+        live = [name for name in self.units if name in self.parents and (name not in parents or name == child)]
         if not live:
             return state
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
 
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
+    def step(
+        self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]], count: int = 1
+    ) -> tuple[Parameters, Any]:
         """Return the parameters (B, D) at step t and the next state of a loop over time.
 
         Args:
             state: result of `start` or of the previous step.
             t: index of the step, from 0.
-            drawn: values (B, D) by step of the variables that the loop draws, by name.
+            samples: values (B, D) by step of the variables that the loop draws, by name.
             count: number of steps that are evaluated at once, of which t is the last.
         """
         if self.network is None:
             return tuple(p[t] for p in state), state
-        inner, inputs = self._standardise_draws(state, drawn)
+        inner, inputs = self._standardise_draws(state, samples)
         if count > 1:
             features, inner = self.network.forward_last(inner, t + 1 - count, count, inputs)
         else:
@@ -325,12 +327,12 @@ class Conditional(nn.Module):
         previous = None
         if self.head.residual:
             previous = at(
-                (drawn if self._output_units is None else inputs)[self.factor.child], t - 1, features, self.size
+                (samples if self._output_units is None else inputs)[self.factor.child], t - 1, features, self.size
             )
         return self._rescale(self.head(features, previous, t)), self._with_network_state(state, inner)
 
     def forward_chunk(
-        self, state: Any, t: int, count: int, drawn: Mapping[str, Sequence[Tensor]]
+        self, state: Any, t: int, count: int, samples: Mapping[str, Sequence[Tensor]]
     ) -> tuple[Parameters, Any]:
         """Return the parameters (B, N, D) at N steps whose inputs are all known, and the next state.
 
@@ -338,26 +340,26 @@ class Conditional(nn.Module):
             state: result of `start` or of the previous step.
             t: index of the first of these steps, from 0.
             count: N.
-            drawn: values (B, D) by step of the variables that the loop draws, by name.
+            samples: values (B, D) by step of the variables that the loop draws, by name.
         """
         if self.network is None:
             return tuple(torch.stack(p[t : t + count], dim=1) for p in state), state
-        inner, inputs = self._standardise_draws(state, drawn)
+        inner, inputs = self._standardise_draws(state, samples)
         features, inner = self.network.forward_chunk(inner, t, count, inputs)
         previous = None
         if self.head.residual:
-            values = (drawn if self._output_units is None else inputs)[self.factor.child]
+            values = (samples if self._output_units is None else inputs)[self.factor.child]
             previous = stack_steps(values, t - 1, count, features, self.size)
         return self._rescale(self.head(features, previous, t)), self._with_network_state(state, inner)
 
-    def _standardise_draws(self, state: Any, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
+    def _standardise_draws(self, state: Any, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
         """Return the state of the network, and the draws standardised as the network reads them."""
         if not isinstance(state, Standardised):
-            return state, drawn
+            return state, samples
         standardised = {
-            n: extend_features(rows, drawn[n], self.units[n], state.lengths) for n, rows in state.kept.items()
+            n: extend_features(rows, samples[n], self.units[n], state.lengths) for n, rows in state.kept.items()
         }
-        return state.network, {**drawn, **standardised}
+        return state.network, {**samples, **standardised}
 
     def select(self, state: Any, rows: Tensor) -> Any:
         """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles."""

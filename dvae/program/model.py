@@ -703,10 +703,10 @@ def _check_sizes(sizes: Mapping[str, int]) -> dict[str, int]:
     return dict(sizes)
 
 
-def _by_factor(given: Any, default: Any, what: str) -> dict[str, Any]:
-    table = dict(given) if isinstance(given, Mapping) else {} if given is None else {"default": given}
+def _by_factor(specs: Any, default: Any, label: str) -> dict[str, Any]:
+    table = dict(specs) if isinstance(specs, Mapping) else {} if specs is None else {"default": specs}
     for key, spec in table.items():
         if isinstance(spec, type) or not hasattr(spec, "build"):
             text = kind_of(spec) if isinstance(spec, type) else repr(spec)
-            raise ValueError(f"the {what} of {key!r} is {text}; expected a description such as {default!r}")
+            raise ValueError(f"the {label} of {key!r} is {text}; expected a description such as {default!r}")
     return {"default": default, **table}

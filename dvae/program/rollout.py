@@ -445,7 +445,7 @@ class Rollout:
         known = self.values.keys() | self.states.keys()
         live = [name for name in block.names if (name not in known if hidden is None else name in hidden)]
         values = {**self.known, **(replacements or {})}
-        given = {name: value for name, value in values.items() if name not in live}
+        inputs = {name: value for name, value in values.items() if name not in live}
         loop = any(parent in live for name in live for parent in self.conditionals[name].parents)
         noise = {
             name: self.conditionals[name].head.noise(
@@ -455,11 +455,11 @@ class Rollout:
             if (hidden is None or self.drawing) and name not in self.mean_emission
         }
         if loop:
-            return self._loop(block, live, given, noise, hidden, self.prefix if hidden is None else values)
+            return self._loop(block, live, inputs, noise, hidden, self.prefix if hidden is None else values)
         draws = {}
         for name in live:
             conditional = self.conditionals[name]
-            parameters = conditional(given, self.batch, self.length, self.lengths)
+            parameters = conditional(inputs, self.batch, self.length, self.lengths)
             drawing = name in noise
             value = conditional.draw(parameters, noise[name]) if drawing else conditional.mean(parameters)
             if hidden is not None:
@@ -477,13 +477,13 @@ class Rollout:
         self,
         block: Block,
         live: list[str],
-        given: Mapping[str, Tensor],
+        inputs: Mapping[str, Tensor],
         noise: Mapping[str, Tensor],
         hidden: Mapping[str, Hidden] | None,
         targets: Mapping[str, Tensor],
     ) -> dict[str, Tensor]:
         draw = {name: self.conditionals[name].drawing for name in live}
-        states = {name: self.conditionals[name].start(given, self.batch, self.length, self.lengths) for name in live}
+        states = {name: self.conditionals[name].start(inputs, self.batch, self.length, self.lengths) for name in live}
         padded = self._valid is not None and block.direction < 0  # a backward loop starts in the padding
         if len(live) == 1 and hidden is None and not padded and live[0] in noise and live[0] not in self.prefix:
             name = live[0]
@@ -726,6 +726,6 @@ def _check_custom_masks(factorization: Factorization, length: int) -> None:
                     )
 
 
-def _same(value: Tensor, drawn: Tensor) -> bool:
+def _same(value: Tensor, draw: Tensor) -> bool:
     """Return whether a site's value equals the draw; tensors may differ, since Pyro may detach the draw."""
-    return value is drawn or torch.equal(value, drawn)
+    return value is draw or torch.equal(value, draw)

@@ -66,7 +66,7 @@ class Dataset(Protocol):
 
 
 def open_data(
-    run: str | os.PathLike[str], kind: str, source: Any, schema: Any, where: str | os.PathLike[str] | None = None
+    run: str | os.PathLike[str], kind: str, source: Any, schema: Any, path: str | os.PathLike[str] | None = None
 ) -> Any:
     """Open the data of a run.
 
@@ -75,22 +75,22 @@ def open_data(
         kind: kind of the data.
         source: source of the data, as returned by `Dataset.recorded`.
         schema: schema of the data.
-        where: current path of the data; by default the path in `source`.
+        path: current path of the data; by default the path in `source`.
 
     Raises:
         CheckpointError: the data are missing or have changed.
     """
-    where = os.fspath(where or source.path)
+    path = os.fspath(path or source.path)
     try:
-        data = DATA[kind].reopened(source, schema, where)
+        data = DATA[kind].reopened(source, schema, path)
     except FileNotFoundError as error:
         raise CheckpointError(
-            f"{run} was fitted on {source.path}, but {where} does not exist; relative paths start from the working "
+            f"{run} was fitted on {source.path}, but {path} does not exist; relative paths start from the working "
             "directory, so change to the directory of the fit, or give the path of these or other data (--data)"
         ) from error
     if data.fingerprint != source.fingerprint:
         raise CheckpointError(
-            f"{where} has changed since {run} was fitted on it: its fingerprint is {data.fingerprint[:12]}…, the "
+            f"{path} has changed since {run} was fitted on it: its fingerprint is {data.fingerprint[:12]}…, the "
             f"run's {source.fingerprint[:12]}…; restore the file, or fit again"
         )
     return data

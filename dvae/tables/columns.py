@@ -281,15 +281,15 @@ def parsed(text: str) -> dict[str, Any]:
         raise ValueError("its tables are nested too deeply; expected two levels, such as [columns.riders]") from None
 
 
-def layout(told: Mapping[str, Any]) -> dict[str, Any]:
+def layout(schema: Mapping[str, Any]) -> dict[str, Any]:
     """Check and return the entries of a schema that describe the whole table.
 
     Raises:
         ValueError: if an entry is unknown or has another type.
     """
-    _refuse_others(told, (item.name for item in fields(Columns)), "the schema")
+    _refuse_others(schema, (item.name for item in fields(Columns)), "the schema")
     entries: dict[str, Any] = {}
-    for name, value in told.items():
+    for name, value in schema.items():
         many = isinstance(value, list | tuple)
         items = tuple(value) if many else (value,)
         if (name in ("id", "time", "na_values") and many) or name in ("id", "na_values"):

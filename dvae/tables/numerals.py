@@ -49,12 +49,12 @@ class Numbers:
         """Whether every cell is a number or missing, and some cell is a number."""
         return not self.wrong.any() and bool((~np.isnan(self.values)).any())
 
-    def check(self, column: Any, how: str) -> None:
+    def check(self, column: Any, remedy: str) -> None:
         """Raise an error that names a cell that is not a number, and a remedy.
 
         Args:
             column: the column that was read.
-            how: end of the message, with a further remedy.
+            remedy: end of the message, with a further remedy.
 
         Raises:
             ValueError: if cells are not numbers, or depend on the decimal sign.
@@ -73,7 +73,7 @@ class Numbers:
         share = f"{n_values - n_wrong} of {n_values} values are numbers; " if n_values > n_wrong else ""
         raise ValueError(
             f"column {column.name!r}: {share}row {row} is {cell}, which is not a number; correct it, list it in "
-            f"na_values (--na-values) if it marks a missing value, {how}"
+            f"na_values (--na-values) if it marks a missing value, {remedy}"
         )
 
 

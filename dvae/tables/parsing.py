@@ -311,40 +311,41 @@ def _localize(local: Any, zone: str, sequences: Iterable[np.ndarray] | None, col
     return type(local)(moments)
 
 
-def numeric(column: Any, told: Column, na_values: Sequence[str] = (), decimal: str | None = None) -> np.ndarray:
+def numeric(column: Any, schema: Column, na_values: Sequence[str] = (), decimal: str | None = None) -> np.ndarray:
     """Return the values as numbers, NaN if missing; a category is the index of its class.
 
     Args:
         column: (N,) of any type.
-        told: schema of the column, with its family and classes.
+        schema: schema of the column, with its family and classes.
         na_values: further texts or numbers that mark missing values; a listed class remains a class.
         decimal: "." or ",", the decimal sign of texts.
 
     Raises:
         ValueError: if values are invalid for the column.
     """
-    if told.family == "category":
-        indices = {label: index for index, label in enumerate(told.classes)}
+    if schema.family == "category":
+        indices = {label: index for index, label in enumerate(schema.classes)}
         labels = texts(column)
         labels = labels.mask(labels.isin([label for label in na_values if label not in indices]))
         unknown = labels.notna() & ~labels.isin(list(indices))
-        if told.other:
-            labels = labels.mask(unknown, told.other)
+        if schema.other:
+            labels = labels.mask(unknown, schema.other)
         elif unknown.any():
             value = labels[unknown].iloc[0]
             raise ValueError(
-                f"column {told.name!r} has {brief(value)}{nearest(value, indices)}, which is not one of its classes: "
-                f"{', '.join(told.classes[:10])}; to read all other values as one, set other = {told.classes[-1]!r}"
+                f"column {schema.name!r} has {brief(value)}{nearest(value, indices)}, which is not one of its classes: "
+                f"{', '.join(schema.classes[:10])}; to read all other values as one, set other = {schema.classes[-1]!r}"
             )
         return labels.map(indices).to_numpy(np.float64)  # type: ignore[no-any-return]
     if column.dtype.kind in "mMc":
         raise ValueError(
-            f"column {told.name!r} has type {column.dtype}, not numbers; leave it out, or give it the family 'category'"
+            f"column {schema.name!r} has type {column.dtype}, not numbers; leave it out, or give it the family "
+            "'category'"
         )
     numbers = read_numbers(column, na_values, decimal, column.attrs.get("decimal"))
     numbers.check(column, "or give the column the family 'category'")
     if numbers.marks:
-        warnings.warn(f"column {told.name!r} {describe_marks(numbers.marks)}", stacklevel=2)
+        warnings.warn(f"column {schema.name!r} {describe_marks(numbers.marks)}", stacklevel=2)
     return numbers.values
 
 

@@ -311,18 +311,18 @@ def effective_size(log_weights: Tensor) -> Tensor:
     return weights.sum(0).square() / weights.square().sum(0)
 
 
-def ancestors(log_weights: Tensor, chosen: Tensor) -> Tensor:
+def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
     """Return the rows (K B,) of ancestors under systematic resampling with weights (K, B).
 
-    Particle k has floor(K w_k) descendants or one more, and K w_k on average. Particles of sequences that are not
-    `chosen` (B,) are their own ancestors.
+    Particle k has floor(K w_k) descendants or one more, and K w_k on average. Particles of sequences
+    where `mask` (B,) is False are their own ancestors.
     """
     count, batch = log_weights.shape
     identity = torch.arange(count, device=log_weights.device)[:, None]
     cumulative = log_weights.double().softmax(0).cumsum(0)
     points = (identity + torch.rand(batch, dtype=torch.double, device=identity.device)) / count * cumulative[-1]
     resampled = torch.searchsorted(cumulative.t().contiguous(), points.t().contiguous(), right=True).t()
-    particle = torch.where(chosen, resampled.clamp_(max=count - 1), identity)
+    particle = torch.where(mask, resampled.clamp_(max=count - 1), identity)
     return (particle * batch + torch.arange(batch, device=identity.device)).flatten()
 
 

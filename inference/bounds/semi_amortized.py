@@ -144,44 +144,48 @@ class CorrectedConditional(nn.Module):
     """Corrected conditional of the guide, which replaces the original one.
 
     Args:
-        own: conditional of the guide.
+        conditional: conditional of the guide.
         factor: factor with all parents that the corrected conditional reads.
         correction: correction of the conditional.
     """
 
-    def __init__(self, own: Conditional, factor: Factor, correction: Correction):
+    def __init__(self, conditional: Conditional, factor: Factor, correction: Correction):
         super().__init__()
-        self.own, self.factor, self.correction = own, factor, correction
+        self.conditional, self.factor, self.correction = conditional, factor, correction
         self.parents = [parent.name for parent in factor.parents]
 
     def __getattr__(self, name: str) -> Any:
         """Return the attribute of the guide's conditional."""
-        return super().__getattr__(name) if name == "own" else getattr(self.own, name)
+        return super().__getattr__(name) if name == "conditional" else getattr(self.conditional, name)
 
     def forward(self, parents: Mapping[str, Tensor], *arguments: Any) -> Parameters:
         """Return the corrected parameters; same arguments as in `Conditional`."""
         values = {link.parent: _by_step(parents[link.parent]) for link in self.correction.links}
-        parameters = self.own(parents, *arguments)
+        parameters = self.conditional(parents, *arguments)
         if self.factor.local:
             return self.correction(parameters, values)
         return _without_step(self.correction(_with_step(parameters), values))
 
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """Return the state of the guide's loop, or its parameters by step if it reads no drawn variable."""
-        values = {link.parent: _by_step(given[link.parent]) for link in self.correction.links if link.parent in given}
+        values = {
+            link.parent: _by_step(parents[link.parent]) for link in self.correction.links if link.parent in parents
+        }
         steps = self.correction.by_step()
-        if all(name in given for name in self.own.parents):
-            return tuple(p.unbind(1) for p in self.own(given, batch, length, lengths)), None, values, steps
-        return None, self.own.start(given, batch, length, lengths), values, steps
+        if all(name in parents for name in self.conditional.parents):
+            return tuple(p.unbind(1) for p in self.conditional(parents, batch, length, lengths)), None, values, steps
+        return None, self.conditional.start(parents, batch, length, lengths), values, steps
 
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]], count: int = 1) -> tuple[Parameters, Any]:
+    def step(
+        self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]], count: int = 1
+    ) -> tuple[Parameters, Any]:
         """Return the corrected parameters; same arguments as in `Conditional`."""
         fixed, inner, values, steps = state
         if fixed is None:
-            parameters, inner = self.own.step(inner, t, drawn, count)
+            parameters, inner = self.conditional.step(inner, t, samples, count)
         else:
             parameters = tuple(p[t] for p in fixed)
-        return _without_step(steps[t](_with_step(parameters), {**drawn, **values})), (fixed, inner, values, steps)
+        return _without_step(steps[t](_with_step(parameters), {**samples, **values})), (fixed, inner, values, steps)
 
     def chain(self, *_: Any) -> None:
         """Return None, as no fused loop exists."""
@@ -339,7 +343,7 @@ def _with_guide(
     for name, correction in corrections.items():
         conditional = model.encoder[name]
         encoder[name] = CorrectedConditional(
-            conditional.own if isinstance(conditional, CorrectedConditional) else conditional,
+            conditional.conditional if isinstance(conditional, CorrectedConditional) else conditional,
             corrected.inference.factor(name),
             correction,
         )

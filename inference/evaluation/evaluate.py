@@ -306,27 +306,27 @@ def _references(
     return truths | {name: available[name] for name in requested}
 
 
-def forecaster_of(model: Any, held: EvaluationWindows, samples: int, options: Mapping[str, Any]) -> Forecaster:
+def forecaster_of(model: Any, windows: EvaluationWindows, samples: int, options: Mapping[str, Any]) -> Forecaster:
     """Return a function that forecasts futures (K, B, H, D) of a slice of windows.
 
     Args:
         model: model that forecasts.
-        held: windows to forecast.
+        windows: windows to forecast.
         samples: K, number of futures per window.
         options: further arguments of the model's `forecast`.
     """
-    horizon = held.futures.shape[1]
-    return lambda part: model.forecast(on_device_of(model, held.past(part)), horizon, samples, **options)["x"]
+    horizon = windows.futures.shape[1]
+    return lambda part: model.forecast(on_device_of(model, windows.past(part)), horizon, samples, **options)["x"]
 
 
-def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: EvaluationWindows, part: slice) -> Tensor:
+def forecasts_of(name: str, forecaster: Forecaster, samples: int, windows: EvaluationWindows, part: slice) -> Tensor:
     """Return futures `(B, K, H, D)` of some windows, on the CPU.
 
     Args:
         name: name of the method, for errors.
         forecaster: function from a slice of windows to futures (K, B, H, D).
         samples: K, number of futures per window.
-        held: all windows.
+        windows: all windows.
         part: slice of the windows to forecast.
 
     Raises:
@@ -334,11 +334,11 @@ def forecasts_of(name: str, forecaster: Forecaster, samples: int, held: Evaluati
         FloatingPointError: when forecasts are not finite.
     """
     forecasts = forecaster(part).cpu()
-    expected = (samples, *held.futures[part].shape)
+    expected = (samples, *windows.futures[part].shape)
     if forecasts.shape != expected:
         raise ValueError(f"forecasts of {name} must be (K, B, T, D) = {expected}, got {tuple(forecasts.shape)}")
     if not forecasts.sum().isfinite():  # 40 times faster than a test of each value
-        refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), held.keys[part])
+        refuse_non_finite(name, "forecast", forecasts.isfinite().all(-1).all(-1).all(0), windows.keys[part])
     return forecasts.movedim(0, 1)
 
 

@@ -148,12 +148,12 @@ def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
     return Batch(batch).map(to_device)
 
 
-def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
+def refuse_non_finite(name: str, quantity: str, finite: Tensor, keys: Sequence[tuple[str, str, int]]) -> None:
     """Raise an error if a result is not finite, which names the first such window.
 
     Args:
         name: name of the method.
-        what: name of the result, such as "bound".
+        quantity: name of the result, such as "bound".
         finite: (B,), whether the result of each window is finite.
         keys: (split, clip, first frame) of each window.
 
@@ -163,6 +163,6 @@ def refuse_non_finite(name: str, what: str, finite: Tensor, keys: Sequence[tuple
     if not finite.all():
         split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
         raise FloatingPointError(
-            f"the {what} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
+            f"the {quantity} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
             "it cannot be omitted, because all methods are scored on the same windows"
         )

@@ -370,7 +370,7 @@ def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tu
     return jackknife_pseudo_values(distance[0], distance[1:], places)
 
 
-def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
+def jackknife_pseudo_values(distance: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
     """Return the distance of a set of windows as a jackknife pseudo-value of each clip.
 
     The pseudo-value is d + (1/w - 1) (d - d') (Busing, Meijer and van der Leeden 1999). d' is the distance without the
@@ -379,13 +379,13 @@ def jackknife_pseudo_values(whole: Tensor, without: Tensor, places: Tensor) -> t
     clips, so the errors of both kinds of scores are computed alike.
 
     Args:
-        whole: d, distance of the whole set.
+        distance: d, distance of the whole set.
         without: d' of each of C > 1 clips, `(C,)`.
         places: clip of every window, `(N,)`.
     """
     shares = places.bincount().double() / len(places)
-    pseudo = whole + (1 / shares - 1) * (whole - (without if len(shares) > 1 else whole))
-    return tuple((pseudo - (shares * pseudo).sum() + whole).tolist())
+    pseudo = distance + (1 / shares - 1) * (distance - (without if len(shares) > 1 else distance))
+    return tuple((pseudo - (shares * pseudo).sum() + distance).tolist())
 
 
 def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:

@@ -42,7 +42,9 @@ def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
     return interpolate_missing(x, mask)[:, -1], mask.any(1)
 
 
-def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: Tensor | None = None) -> Tensor:
+def distances(
+    first: Tensor, second: Tensor, first_mask: Tensor | None = None, second_mask: Tensor | None = None
+) -> Tensor:
     """Return Euclidean distances `(N, M)` between `(N, D)` and `(M, D)`.
 
     If coordinates are missing, the mean squared difference over the coordinates that both points have is multiplied by
@@ -50,13 +52,13 @@ def distances(first: Tensor, second: Tensor, seen: Tensor | None = None, also: T
 
     Args:
         first, second: points, with any value at a missing coordinate.
-        seen, also: masks `(N, D)` of `first` and `(M, D)` of `second`, True where observed; None for all.
+        first_mask, second_mask: masks `(N, D)` of `first` and `(M, D)` of `second`, True where observed; None for all.
     """
-    if seen is None and also is None:
+    if first_mask is None and second_mask is None:
         # Matrix-product distances would be too inexact for poses far from the origin, or at a threshold.
         return torch.cdist(first, second, compute_mode=_EXACT)
-    first_mask = torch.ones_like(first, dtype=torch.bool) if seen is None else seen
-    second_mask = torch.ones_like(second, dtype=torch.bool) if also is None else also
+    first_mask = torch.ones_like(first, dtype=torch.bool) if first_mask is None else first_mask
+    second_mask = torch.ones_like(second, dtype=torch.bool) if second_mask is None else second_mask
     first_weights, second_weights = first_mask.to(first), second_mask.to(second)
     # Far from 0, differences of squares would lose digits.
     centre = (torch.where(second_mask, second, 0.0).sum(0) / second_weights.sum(0).clamp(min=1)).double()

@@ -270,7 +270,7 @@ class Result(Displayed):
             file.write(dataset.to_netcdf())
 
 
-def progress_bar(shown: bool) -> Progress:
+def progress_bar(visible: bool) -> Progress:
     """Return a progress bar that disappears at the end, hidden where it cannot be updated (as without ipywidgets)."""
     console = Console()
     moves = find_spec("ipywidgets") is not None if console.is_jupyter else console.is_terminal
@@ -279,5 +279,5 @@ def progress_bar(shown: bool) -> Progress:
         *Progress.get_default_columns()[1:],
         transient=True,
         console=console,
-        disable=not (shown and moves),
+        disable=not (visible and moves),
     )

@@ -332,7 +332,7 @@ def state_bytes(model: nn.Module, copies: int = 1) -> int:
 
 
 @contextmanager
-def at_most(size: int, what: str) -> Iterator[None]:
+def at_most(size: int, subject: str) -> Iterator[None]:
     """Prevent this thread from building modules with more parameters and buffers than `size` allows.
 
     A number usually takes two or four bytes in a file of weights. The limit is one number per byte plus a margin,
@@ -340,13 +340,13 @@ def at_most(size: int, what: str) -> Iterator[None]:
 
     Args:
         size: size of the file of weights in bytes.
-        what: subject of errors, such as the path of the run.
+        subject: subject of errors, such as the path of the run.
 
     Raises:
         CheckpointError: when the limit is exceeded.
     """
     if size > LARGEST_WEIGHTS:
-        raise CheckpointError(f"{what} has {size} bytes of weights, but at most {LARGEST_WEIGHTS} are supported")
+        raise CheckpointError(f"{subject} has {size} bytes of weights, but at most {LARGEST_WEIGHTS} are supported")
     remaining, thread = size + 2**24, threading.get_ident()
 
     def count(module: nn.Module, name: str, value: Tensor | None) -> None:
@@ -355,8 +355,8 @@ def at_most(size: int, what: str) -> Iterator[None]:
             remaining -= value.numel()
             if remaining < 0:
                 raise CheckpointError(
-                    f"{what} describes a model that is larger than its weights of {size} bytes; either it is damaged, "
-                    "or the weights are from another run"
+                    f"{subject} describes a model that is larger than its weights of {size} bytes; either it is "
+                    "damaged, or the weights are from another run"
                 )
 
     hooks = [

@@ -167,11 +167,11 @@ class Bar:
     Args:
         name: name of the fit.
         steps: last step of the run.
-        shown: whether to display the bar.
+        visible: whether to display the bar.
     """
 
-    def __init__(self, name: str, steps: int, shown: bool) -> None:
-        self._bar = progress_bar(shown)
+    def __init__(self, name: str, steps: int, visible: bool) -> None:
+        self._bar = progress_bar(visible)
         self._task = self._bar.add_task(name, total=steps)
 
     def start(self, step: int) -> None:

@@ -129,5 +129,5 @@ class SummaryDecoderNetwork(FedBackNetwork):
     @override
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
         code = self.past(parents[HISTORY])
-        static = code if self.own else torch.cat([code, parents[self.latent]], -1)
+        static = code if self.local_latent else torch.cat([code, parents[self.latent]], -1)
         return static[:, None], parents[HISTORY][:, -self.past.size :], self.first(code)

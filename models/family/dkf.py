@@ -79,14 +79,14 @@ class GatedTransition(Network):
         return self._features(previous, self._other_parents(parents, len(previous), length))
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        return self(given, length).unbind(1) if self.name in given else self._other_parents(given, batch, length)
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        return self(parents, length).unbind(1) if self.name in parents else self._other_parents(parents, batch, length)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         if isinstance(state, tuple):
             return state[t], state
-        return self._features(at(drawn[self.name], t - 1, state, self.size), state[:, t]), state
+        return self._features(at(samples[self.name], t - 1, state, self.size), state[:, t]), state
 
 
 @dataclass(frozen=True)

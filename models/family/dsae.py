@@ -69,12 +69,12 @@ class LayeredNetwork(Network):
         return Recurrence.apply(base.to(top.weight_hh_l0.dtype), top.weight_hh_l0).transpose(0, 1)
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         """Return the features of all steps, because a parent over {1:T} is never drawn in the same loop."""
-        return self(given, length, lengths).unbind(1)
+        return self(parents, length, lengths).unbind(1)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         return state[t], state
 
 

@@ -362,28 +362,28 @@ class KalmanNetwork(Network):
         return loc, InverseCholesky.apply(spread).flatten(-2)
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         name, zero = self.inputs[0].name, self.first.new_zeros(batch, self.spec.width)
-        values, present = (given[key].unbind(1) if key in given else None for key in (name, presence(name)))
+        values, present = (parents[key].unbind(1) if key in parents else None for key in (name, presence(name)))
         return Predicted(values, present, (zero, zero), *self.start_of(batch)[:2], None)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         with torch.autocast(self.A.device.type, enabled=False):
-            state = self.ahead(state, t, drawn)
+            state = self.ahead(state, t, samples)
             features = torch.cat(self.parts_of(state.mean, state.covariance, state.emission), dim=-1)
         return features.to(self.A.dtype), state
 
-    def ahead(self, state: Predicted, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> Predicted:
+    def ahead(self, state: Predicted, t: int, samples: Mapping[str, Sequence[Tensor]]) -> Predicted:
         """Return the prediction of step t from the prediction of step t-1 and from a_{t-1}.
 
         Args:
             state: prediction of step t-1.
             t: index of the step, from 0.
-            drawn: values (B, D) by step of the variables that a loop draws, by name; read if `state` has no given a.
+            samples: values (B, D) by step of the variables that a loop draws, by name; read if `state` has no given a.
         """
         mean, covariance, emission = state.mean, state.covariance, state.emission
-        values = drawn[self.inputs[0].name] if state.known is None else state.known
+        values = samples[self.inputs[0].name] if state.known is None else state.known
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)
         present = None if state.present is None or not t else state.present[t - 1]
         if present is not None:

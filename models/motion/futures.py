@@ -176,31 +176,31 @@ class FedBackNetwork(Network):
 
     Args:
         inputs: parents of x.
-        known: number of inputs known at each step, without x_{t-1}.
+        known_size: number of inputs known at each step, without x_{t-1}.
         size: D, size of x.
         width: width of the states.
         hidden: widths of the perceptron.
-        own: name and size of a local latent, which the perceptron reads together with the state of its step.
+        local_latent: name and size of a local latent, which the perceptron reads together with the state of its step.
     """
 
     def __init__(
         self,
         inputs: Sequence[Input],
-        known: int,
+        known_size: int,
         size: int,
         width: int,
         hidden: Sequence[int],
-        own: tuple[str, int] | None = None,
+        local_latent: tuple[str, int] | None = None,
     ) -> None:
         super().__init__(inputs, True, (width, *hidden)[-1])
-        self.share, (self.own, latent) = known, own or ("", 0)
-        self.cell: Any = GRU(known + size, width, batch_first=True)
+        self.share, (self.local_latent, latent) = known_size, local_latent or ("", 0)
+        self.cell: Any = GRU(known_size + size, width, batch_first=True)
         self.behind = perceptron((width + latent, *hidden), "tanh")
 
     def known(self, parents: Mapping[str, Tensor], length: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the inputs known at each step, the pose before the first (B, D), and the first state (B, W).
 
-        The inputs are (B, T, known), or (B, 1, known) if they are the same at all steps.
+        The inputs are (B, T, known_size), or (B, 1, known_size) if they are the same at all steps.
 
         Args:
             parents: values of the parents by name.
@@ -214,26 +214,28 @@ class FedBackNetwork(Network):
         inputs, first, state = self.known(parents, length)
         before = torch.cat([first[:, None], parents[WHOLE][:, : length - 1]], 1)
         states = self.cell(torch.cat([inputs.expand(-1, length, -1), before], -1), state[None].contiguous())[0]
-        features: Tensor = self.behind(torch.cat([states, parents[self.own]], -1) if self.own else states)
+        features: Tensor = self.behind(
+            torch.cat([states, parents[self.local_latent]], -1) if self.local_latent else states
+        )
         return features
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        inputs, first, state = self.known(given, length)
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        inputs, first, state = self.known(parents, length)
         weight, bias = self.cell.weight_ih_l0[:, : self.share], self.cell.bias_ih_l0
-        latents = given[self.own].unbind(1) if self.own in given else None
+        latents = parents[self.local_latent].unbind(1) if self.local_latent in parents else None
         shares = functional.linear(inputs, weight, bias).expand(-1, length, -1)
-        return shares.unbind(1), first, given.get(WHOLE), latents, state
+        return shares.unbind(1), first, parents.get(WHOLE), latents, state
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         shares, first, observed, latents, hidden = state
-        before = first if t == 0 else drawn[WHOLE][t - 1] if observed is None else observed[:, t - 1]
+        before = first if t == 0 else samples[WHOLE][t - 1] if observed is None else observed[:, t - 1]
         gates = torch.addmm(shares[t], before, self.cell.weight_ih_l0[:, self.share :].t())
         hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
         inputs = hidden
-        if self.own:
-            inputs = torch.cat([hidden, drawn[self.own][t] if latents is None else latents[t]], -1)
+        if self.local_latent:
+            inputs = torch.cat([hidden, samples[self.local_latent][t] if latents is None else latents[t]], -1)
         return self.behind(inputs), (shares, first, observed, latents, hidden)
 
 

@@ -332,13 +332,13 @@ class FutureDecoderNetwork(Network):
         return output + before if self.velocity else output
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        return self.code(given), given["z"], given.get(WHOLE), self._last(given)
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        return self.code(parents), parents["z"], parents.get(WHOLE), self._last(parents)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         hidden, z, observed, first = state
-        before = first if t == 0 else drawn[WHOLE][t - 1] if observed is None else observed[:, t - 1]
+        before = first if t == 0 else samples[WHOLE][t - 1] if observed is None else observed[:, t - 1]
         gates = torch.nn.functional.linear(before, self.cell.weight_ih_l0, self.cell.bias_ih_l0)
         hidden = gru_cell(gates, (hidden, hidden), self.cell)[0]
         return self._pose(hidden, z if z.dim() == 2 else z[:, t], before), (hidden, z, observed, first)

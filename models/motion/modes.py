@@ -372,12 +372,12 @@ class ModesDecoderNetwork(Network):
         return features
 
     @override
-    def start(self, given: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
-        return self.decoder.start(self._with_code(given), batch, length, lengths)
+    def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
+        return self.decoder.start(self._with_code(parents), batch, length, lengths)
 
     @override
-    def step(self, state: Any, t: int, drawn: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        return self.decoder.step(state, t, drawn)
+    def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
+        return self.decoder.step(state, t, samples)
 
     def _with_code(self, parents: Mapping[str, Tensor]) -> dict[str, Tensor]:
         modes = self.sampler(parents[HISTORY])

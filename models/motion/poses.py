@@ -26,7 +26,7 @@ def table(options: str, rows: Mapping[str, Sequence[Any]]) -> dict[str, dict[str
     return {skeleton: dict(zip(options.split(), values, strict=True)) for skeleton, values in rows.items()}
 
 
-def without_gaps(skeleton: Skeleton, poses: Tensor, seen: Tensor) -> Tensor:
+def without_gaps(skeleton: Skeleton, poses: Tensor, mask: Tensor) -> Tensor:
     """Return poses (B, T, D) without a root, with missing joints filled in.
 
     Our choice: across missing frames, a joint is interpolated linearly in time. A joint that is never observed is at
@@ -35,10 +35,10 @@ def without_gaps(skeleton: Skeleton, poses: Tensor, seen: Tensor) -> Tensor:
     Args:
         skeleton: skeleton of the poses.
         poses: (B, T, D), with any values at missing entries.
-        seen: (B, T, D), True where an entry was observed.
+        mask: (B, T, D), True where an entry was observed.
     """
     positions, is_observed = (
-        skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (interpolate_missing(poses, seen), seen.any(1))
+        skeleton.with_root(x.unflatten(-1, (-1, 3))) for x in (interpolate_missing(poses, mask), mask.any(1))
     )
     for joint in skeleton.order[1:]:
         parent = positions[..., skeleton.parents[joint], :]

@@ -345,8 +345,8 @@ class Scaled(View):
     def __call__(self, data, view_inputs=None):
         return {**data, "x": data["x"] * FACTORS} if "x" in data and "log_det" not in data else dict(data)
 
-    def inverse(self, seen):
-        return {**seen, "x": seen["x"] / FACTORS} if "x" in seen else dict(seen)
+    def inverse(self, model_values):
+        return {**model_values, "x": model_values["x"] / FACTORS} if "x" in model_values else dict(model_values)
 
     def log_det(self, data):
         return FACTORS.abs().log().expand_as(data["x"])
@@ -358,8 +358,10 @@ class Mixed(Scaled):
     def __call__(self, data, view_inputs=None):
         return {**data, "x": data["x"] @ MIXING} if "x" in data and "log_det" not in data else dict(data)
 
-    def inverse(self, seen):
-        return {**seen, "x": seen["x"] @ MIXING.inverse()} if "x" in seen else dict(seen)
+    def inverse(self, model_values):
+        if "x" not in model_values:
+            return dict(model_values)
+        return {**model_values, "x": model_values["x"] @ MIXING.inverse()}
 
     def log_det(self, data):
         return torch.full((len(data["x"]),), data["x"].shape[1] * MIXING.logdet().item(), dtype=data["x"].dtype)

@@ -30,7 +30,7 @@ class ExchangedWindows:
         windows: windows with one observed frame and the same given joints everywhere, e.g. `windows.given(["LWrist"])`.
         threshold: maximum distance in metres between each given joint in the two first frames.
         seed: seed for the choice among partners.
-        own: whether every window keeps its own pose, as a baseline on the same windows.
+        own_pose: whether every window keeps its own pose, as a baseline on the same windows.
         truth: window whose motion is the truth in scores: "path", the window of the paths, as in TrajeVAE's text, or
             "pose", the window of the first pose, as in its public code.
 
@@ -45,7 +45,7 @@ class ExchangedWindows:
         threshold: float = 0.01,
         seed: int = 0,
         *,
-        own: bool = False,
+        own_pose: bool = False,
         truth: Literal["path", "pose"] = "path",
     ):
         if not windows.given_joints or windows.protocol.observed != 1:
@@ -64,11 +64,11 @@ class ExchangedWindows:
         if truth not in ("path", "pose"):
             raise ValueError(f"`truth` must be 'path' or 'pose' (the window whose motion is the truth), got {truth!r}")
         self.windows, self.threshold, self.seed, self.missing = windows, threshold, seed, False
-        self.own, self.truth = own, truth
+        self.own_pose, self.truth = own_pose, truth
         self.protocol, self.skeleton, self.joints = windows.protocol, windows.skeleton, windows.joints
         self.given_joints, self.positions = windows.given_joints, windows.positions
         self._rows, partners = self._pairs()
-        self._partners = self._rows if own else partners
+        self._partners = self._rows if own_pose else partners
 
     def _pairs(self) -> tuple[Tensor, Tensor]:
         """Return the indices of windows with a partner, and of their partners."""
@@ -99,7 +99,10 @@ class ExchangedWindows:
         """Description of the windows and of the exchange of poses, for the record of an evaluation."""
         description, partners = self.windows.description, len(self._partners.unique())
         exchanged = {"threshold": self.threshold, "seed": self.seed, "partners": partners, "truth": self.truth}
-        title = [*description["title"], "with own poses" if self.own else f"first poses of {partners} other windows"]
+        title = [
+            *description["title"],
+            "with own poses" if self.own_pose else f"first poses of {partners} other windows",
+        ]
         return {**description, "exchanged": exchanged, "title": title}
 
     def __len__(self) -> int:

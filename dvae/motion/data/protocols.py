@@ -526,15 +526,15 @@ class Windows:
         ]
         return MotionSet(filled_clips, self.skeleton, missing=bool(positions_of_clips.isnan().any()))
 
-    def to_world(self, positions: Tensor, chosen: Sequence[int] | slice = slice(None)) -> Tensor:
+    def to_world(self, positions: Tensor, indices: Sequence[int] | slice = slice(None)) -> Tensor:
         """Return positions (..., N, T, J, 3) of listed windows in the coordinates of their clips.
 
         Args:
             positions: result of `positions`. If the protocol drops the root, all T frames of each window; otherwise any
                 number of frames.
-            chosen: indices of the N windows in `keys`; default: all.
+            indices: indices of the N windows in `keys`; default: all.
         """
-        clips, starts = (values[chosen] for values in self._list(self.stride))
+        clips, starts = (values[indices] for values in self._list(self.stride))
         joints, root = cut_windows(self._frames, clips, starts, self.length), self.skeleton.root
         if self.protocol.heading:
             heading = self.skeleton.heading_near(joints, self.protocol.observed - 1)[:, None, None]

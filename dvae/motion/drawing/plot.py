@@ -36,7 +36,7 @@ def pose(
     positions: Any,
     skeleton: Skeleton,
     *,
-    at: tuple[float, float] = (0.0, 0.0),
+    offset: tuple[float, float] = (0.0, 0.0),
     azimuth: float = 0.0,
     **line: Any,
 ) -> None:
@@ -46,13 +46,13 @@ def pose(
         ax: axes to draw on; their units are metres.
         positions: (..., J, 3) in metres, numpy or torch.
         skeleton: skeleton of the poses.
-        at: horizontal and vertical offset of the drawing in metres.
+        offset: horizontal and vertical offset of the drawing in metres.
         azimuth: rotation of the people about the up axis in radians.
         **line: options of matplotlib's LineCollection, such as colors, linewidths, alpha.
     """
     poses = torch.as_tensor(np.asarray(positions), dtype=torch.float64).reshape(-1, skeleton.joints, 3)
     rotated = rotate_about_up(poses, torch.tensor(azimuth, dtype=torch.float64), skeleton.up).numpy()
-    drawing = np.stack([rotated[..., 0] + at[0], rotated[..., skeleton.vertical] + at[1]], axis=-1)
+    drawing = np.stack([rotated[..., 0] + offset[0], rotated[..., skeleton.vertical] + offset[1]], axis=-1)
     bones = list(drawing[:, skeleton.edges].reshape(-1, 2, 2))
     ax.add_collection(LineCollection(bones, **{"capstyle": "round", **line}))
 
@@ -118,7 +118,7 @@ def futures(
     def draw(poses: np.ndarray, column: int, **line: Any) -> None:
         is_shared = len(crosses) and columns[column] > now
         origin = middle[columns[column] - now - 1] if is_shared else poses[..., skeleton.root : skeleton.root + 1, :]
-        pose(ax, poses - origin, skeleton, at=(column * SPACING, 0.0), azimuth=azimuth, **line)
+        pose(ax, poses - origin, skeleton, offset=(column * SPACING, 0.0), azimuth=azimuth, **line)
 
     colours = _colours(len(future)).repeat(len(skeleton.edges), axis=0)
     opacity = float(np.clip(6 / len(future), 0.15, 0.9))

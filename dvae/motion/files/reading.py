@@ -301,7 +301,7 @@ def clip_of(
     recording: Recording,
     clip: Clip,
     fps: float,
-    known: Skeleton | None,
+    skeleton: Skeleton | None,
     joints: Sequence[int | str] | Mapping[str, str] | None,
     onto: Skeleton | None,
 ) -> tuple[Clip, Skeleton]:
@@ -311,18 +311,18 @@ def clip_of(
         recording: recording in metres.
         clip: clip that gives the name, split and labels.
         fps: frames per second.
-        known: skeleton of the recording, if known.
+        skeleton: skeleton of the recording, if known.
         joints, onto: same as in `read_motion`.
     """
     recording = select_recording_joints(recording, joints, onto)
-    known = onto or (known if joints is None else None)
-    left, right = (known.left, known.right) if known else sides(recording.names)
+    skeleton = onto or (skeleton if joints is None else None)
+    left, right = (skeleton.left, skeleton.right) if skeleton else sides(recording.names)
     positions, rotations = recording.positions.astype(np.float32), None
     rest: tuple[float, ...] = ()
     if recording.rotations is not None and recording.offsets is not None:
         rotations, rest = recording.rotations.astype(np.float32), tuple(recording.offsets.flatten().tolist())
     tree = tuple(recording.names), tuple(recording.parents), left, right
-    clip_tree = Skeleton(*tree, recording.up or "y", float(fps), known.name if known else clip.name, rest=rest)
+    clip_tree = Skeleton(*tree, recording.up or "y", float(fps), skeleton.name if skeleton else clip.name, rest=rest)
     labels = {**recording.labels, **clip.labels}
     return replace(clip, positions=positions, labels=labels, rotations=rotations), clip_tree
 

@@ -91,7 +91,7 @@ def read_lines(path: Path) -> list[str]:
     return files.read(path, MOST_TEXT, links=True).decode("utf-8-sig", errors="replace").splitlines()
 
 
-def numbers(text: str, where: str) -> np.ndarray:
+def numbers(text: str, location: str) -> np.ndarray:
     """Return all numbers of a text, separated by white space.
 
     Raises:
@@ -105,7 +105,7 @@ def numbers(text: str, where: str) -> np.ndarray:
             values = np.array([np.nan])
     if not np.isfinite(values).all():
         invalid = next((word for word in text.split() if not _is_finite(word)), "")
-        raise ValueError(f"{where}: {invalid[:40]!r} is not a number")
+        raise ValueError(f"{location}: {invalid[:40]!r} is not a number")
     return values
 
 

@@ -136,7 +136,7 @@ def continuous(quaternions: Tensor, dim: int = -3) -> Tensor:
     return quaternions * signs
 
 
-def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
+def in_time(rotations: Tensor, form: str, source_form: str = "matrix") -> Tensor:
     """Convert rotations of J joints over T frames to a form, without the jumps of `from_matrix` between frames.
 
     If a rotation has several quaternions or vectors, each frame uses the one nearest to the previous frame. The first
@@ -146,7 +146,7 @@ def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
     Args:
         rotations: (..., T, J, 3, 3), or (..., T, J, 4) for quaternions.
         form: form of the result.
-        given: form of `rotations`, "matrix" or "quaternion".
+        source_form: form of `rotations`, "matrix" or "quaternion".
 
     Returns:
         (..., T, J, `size(form)`).
@@ -154,10 +154,10 @@ def in_time(rotations: Tensor, form: str, given: str = "matrix") -> Tensor:
     Raises:
         ValueError: as in `from_matrix`.
     """
-    if given == form == "quaternion":
+    if source_form == form == "quaternion":
         values = normalised(rotations)
     else:
-        values = from_matrix(rotations if given == "matrix" else to_matrix(rotations, given), form)
+        values = from_matrix(rotations if source_form == "matrix" else to_matrix(rotations, source_form), form)
     if form == "quaternion":
         return continuous(torch.where(values[..., :1, :, :1] < 0, -values, values))
     return _unwrap(values) if form == "vector" else values

@@ -76,26 +76,26 @@ def _is(value: Any, kind: type) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool)
 
 
-def _values(items: Any, kind: type, what: str, expected: str) -> tuple[Any, ...]:
+def _values(items: Any, kind: type, label: str, expected: str) -> tuple[Any, ...]:
     """Return the values of a list as a tuple, after checking that each is of type `kind`.
 
     Args:
         items: values.
         kind: type of each value.
-        what: name of the list in error messages.
+        label: name of the list in error messages.
         expected: description of the type in error messages.
 
     Raises:
         ValueError: `items` is no list, or an entry has another type.
     """
     if isinstance(items, str | bytes | Mapping) or not isinstance(items, Iterable):
-        raise ValueError(f"{what} is {brief(items)}, expected a list of {expected}")
+        raise ValueError(f"{label} is {brief(items)}, expected a list of {expected}")
     values = tuple(items)
     for index, value in enumerate(values):
         if not _is(value, kind):
-            raise ValueError(f"{what} has {brief(value)} at place {index}, expected {expected}")
+            raise ValueError(f"{label} has {brief(value)} at place {index}, expected {expected}")
         if isinstance(value, str) and not is_name(value):
-            raise ValueError(f"{what} has {brief(value)} at place {index}, expected text that can be printed")
+            raise ValueError(f"{label} has {brief(value)} at place {index}, expected text that can be printed")
     return tuple(map(int, values)) if kind is Integral else values
 
 

@@ -74,8 +74,8 @@ class Heading(View):
         return self._rotate_all(values, -heading) | {HEADING: heading}
 
     @override
-    def inverse(self, seen: Batch) -> Batch:
-        data = Batch(seen)
+    def inverse(self, model_values: Batch) -> Batch:
+        data = Batch(model_values)
         heading = data.pop(HEADING, None)
         return data if heading is None else self._rotate_all(data, heading)
 
@@ -170,8 +170,8 @@ class Bones(View):
         return values | {LENGTHS: self._mean_lengths(limbs[:, : self.frames].norm(dim=-1), data.lengths)}
 
     @override
-    def inverse(self, seen: Batch) -> Batch:
-        data = Batch(seen)
+    def inverse(self, model_values: Batch) -> Batch:
+        data = Batch(model_values)
         lengths = data.pop(LENGTHS, None)
         if lengths is None or WHOLE not in data:
             return data
@@ -327,12 +327,12 @@ class Rotations(View):
         return converted
 
     @override
-    def inverse(self, seen: Batch) -> Batch:
-        data = Batch(seen)
+    def inverse(self, model_values: Batch) -> Batch:
+        data = Batch(model_values)
         bones = data.pop(LENGTHS, None)
-        if WHOLE not in seen:
+        if WHOLE not in model_values:
             return data
-        x, skeleton = seen[WHOLE], self.skeleton
+        x, skeleton = model_values[WHOLE], self.skeleton
         offsets = constant(self._offsets, x)
         if bones is not None:
             children = [child for _, child in skeleton.edges]

@@ -164,9 +164,9 @@ class PosePriorModel(nn.Module):
         """Return no latents: the model has none."""
         return {}
 
-    def forward(self, given: Batch | Tensor, **options: Any) -> Any:
+    def forward(self, inputs: Batch | Tensor, **options: Any) -> Any:
         """Run the program on a batch; or map directions (..., 3 (J - 1)) to noise, as `QRFlowModule.to_noise`."""
-        return self.model(given, **options) if isinstance(given, Mapping) else self.flow.to_noise(given)
+        return self.model(inputs, **options) if isinstance(inputs, Mapping) else self.flow.to_noise(inputs)
 
     def facing(self, x: Tensor) -> Tensor:
         """Return windows (..., T, D), rotated so that frame `forward_at` has heading zero if it is set."""

@@ -66,12 +66,12 @@ def statistics(windows: Windows | ExchangedWindows) -> dict[str, Statistic]:
 
 @styled
 def draw_traversal(
-    found: Traversal, windows: Windows | ExchangedWindows, frame: int = -1, sequence: int = 0, rows: int = 6
+    traversal: Traversal, windows: Windows | ExchangedWindows, frame: int = -1, sequence: int = 0, rows: int = 6
 ) -> Figure:
     """Draw poses of one sequence at one frame, one row per latent coordinate, the one with the largest effect first.
 
     Args:
-        found: traversal of the latent coordinates, returned by `dvae.traverse`.
+        traversal: traversal of the latent coordinates, returned by `dvae.traverse`.
         windows: windows of the skeleton; `positions` converts x to poses.
         frame: index of the frame, the last by default.
         sequence: index of the sequence in the batch.
@@ -79,26 +79,26 @@ def draw_traversal(
     """
     from ..drawing.plot import SPACING, final_heading, hide_axes, pose
 
-    order = found.effect.argsort(descending=True, stable=True)[:rows]
+    order = traversal.effect.argsort(descending=True, stable=True)[:rows]
     skeleton = windows.skeleton
-    poses = windows.positions(found.frames[order, :, sequence])[:, :, frame].double().cpu()
+    poses = windows.positions(traversal.frames[order, :, sequence])[:, :, frame].double().cpu()
     poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
-    middle = int(found.offsets.abs().argmin())
+    middle = int(traversal.offsets.abs().argmin())
     azimuth = math.pi / 5 - final_heading(skeleton, poses[0, middle : middle + 1])
-    figure = new_figure(0.5 + 0.8 * len(found.offsets), 0.6 + 1.6 * len(order))
+    figure = new_figure(0.5 + 0.8 * len(traversal.offsets), 0.6 + 1.6 * len(order))
     panels = figure.subplots(len(order), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     for panel, coordinate, row in zip(panels, order.tolist(), poses, strict=True):
         for column, shifted in enumerate(row):
             offset = (column * SPACING, 0.0)
-            pose(panel, row[middle], skeleton, at=offset, azimuth=azimuth, colors="0.8", linewidths=1.6)
-            pose(panel, shifted, skeleton, at=offset, azimuth=azimuth, colors="C0", linewidths=1.4)
+            pose(panel, row[middle], skeleton, offset=offset, azimuth=azimuth, colors="0.8", linewidths=1.6)
+            pose(panel, shifted, skeleton, offset=offset, azimuth=azimuth, colors="C0", linewidths=1.4)
         hide_axes(panel)
-        title = (
-            f"{found.latent}[{found.coordinates[coordinate]}], which moves x by {float(found.effect[coordinate]):.2g} m"
+        effect = float(traversal.effect[coordinate])
+        panel.set_title(
+            f"{traversal.latent}[{traversal.coordinates[coordinate]}], which moves x by {effect:.2g} m", loc="left"
         )
-        panel.set_title(title, loc="left")
     panels[-1].set_xticks(
-        SPACING * np.arange(len(found.offsets)), [f"{o:+.2g}" if o else "0" for o in found.offsets.tolist()]
+        SPACING * np.arange(len(traversal.offsets)), [f"{o:+.2g}" if o else "0" for o in traversal.offsets.tolist()]
     )
-    panels[-1].set_xlabel(f"offset of {found.latent}, {found.unit} standard deviations")
+    panels[-1].set_xlabel(f"offset of {traversal.latent}, {traversal.unit} standard deviations")
     return figure

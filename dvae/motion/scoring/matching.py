@@ -82,18 +82,18 @@ def parts(names: Sequence[str]) -> dict[str, int]:
     return joint_of
 
 
-def match(names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> list[int]:
+def match(names: Sequence[str], skeleton: Skeleton, aliases: Mapping[str, str] | None = None) -> list[int]:
     """Return the index of the joint that matches each joint of a skeleton.
 
     Args:
         names: names of a file's joints.
         skeleton: skeleton whose joints are matched.
-        said: mapping from names in the file to names in the skeleton, for joints whose names do not match.
+        aliases: mapping from names in the file to names in the skeleton, for joints whose names do not match.
 
     Raises:
         ValueError: some joints have no match.
     """
-    assigned = {new: find(names, old) for old, new in (said or {}).items()}
+    assigned = {new: find(names, old) for old, new in (aliases or {}).items()}
     if unknown := assigned.keys() - set(skeleton.names):
         raise ValueError(
             f"skeleton {skeleton.name!r} has no joint {min(unknown)!r}; it has {', '.join(skeleton.names)}"
@@ -194,9 +194,9 @@ class JointSubset:
         return cls(tuple(selected), tuple(renamed or (names[joint] for joint in selected)), tuple(parents_of))
 
     @classmethod
-    def onto(cls, names: Sequence[str], skeleton: Skeleton, said: Mapping[str, str] | None = None) -> JointSubset:
+    def onto(cls, names: Sequence[str], skeleton: Skeleton, aliases: Mapping[str, str] | None = None) -> JointSubset:
         """Select the joints of a known skeleton, which `match` finds by the meaning of their names."""
-        return cls(tuple(match(names, skeleton, said)), skeleton.names, skeleton.parents)
+        return cls(tuple(match(names, skeleton, aliases)), skeleton.names, skeleton.parents)
 
     def motion(
         self, parents: Sequence[int], positions: np.ndarray, rotations: np.ndarray | None

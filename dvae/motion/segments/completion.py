@@ -1,6 +1,6 @@
 """Prediction and completion: infer whole segments of motion from partial observations.
 
-    p(z) p(beta) p(seen | z, beta),    z, beta* = argmax log p(z, beta | seen)
+    p(z) p(beta) p(observations | z, beta),    z, beta* = argmax log p(z, beta | observations)
 
 A decoder maps z to a segment, including its timing, and beta to a body. The search finds the z and beta that agree best
 with the observations (Marsot et al. 2021, arXiv 2106.04387, sections 5.4 and 5.5). The observations of B segments are
@@ -116,26 +116,30 @@ class SegmentCompletion:
     known: Mapping[str, Any] | None = None
     aggregate: bool = True
 
-    def __call__(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Tensor]:
         """Sample z from `prior` and beta from N(0, I), and score the observations given the decoded motion.
 
         Args:
-            seen: result of `read`. Vertices nearest to points are computed unless `renewed` has added them.
+            observations: result of `read`. Vertices nearest to points are computed unless `renewed` has added them.
 
         Returns:
             z (B, Z) and beta (B, S).
         """
         model, deviations, kind = self.model, self.deviations, like(self.model)
-        size, parameters, prior = len(next(iter(seen.values()))), model.body.parameters_of_shape, self.prior
+        size, parameters, prior = len(next(iter(observations.values()))), model.body.parameters_of_shape, self.prior
         with pyro.plate("sequences", size):
             z = pyro.sample(LATENT, prior.expand([size]))
-            shape = seen[SHAPE] if SHAPE in seen else pyro.sample(SHAPE, _standard(parameters, kind).expand([size]))
-            times, decoded = self._decode(z, shape, seen)
-            if TIMES in seen:
-                _observe(TIMES, times, seen[TIMES], deviations.time)
+            shape = (
+                observations[SHAPE]
+                if SHAPE in observations
+                else pyro.sample(SHAPE, _standard(parameters, kind).expand([size]))
+            )
+            times, decoded = self._decode(z, shape, observations)
+            if TIMES in observations:
+                _observe(TIMES, times, observations[TIMES], deviations.time)
             for name, value in decoded.items():
                 counts = value.shape[-2] if name == SURFACES else 1  # as one vertex
-                _observe(name, value, seen[name], deviations.of(name) * counts**0.5)
+                _observe(name, value, observations[name], deviations.of(name) * counts**0.5)
         return {LATENT: z, SHAPE: shape}
 
     @cached_property
@@ -150,75 +154,84 @@ class SegmentCompletion:
         )
 
     @torch.no_grad()
-    def distances(self, seen: Mapping[str, Any], z: Tensor, shape: Tensor) -> dict[str, Tensor]:
+    def distances(self, observations: Mapping[str, Any], z: Tensor, shape: Tensor) -> dict[str, Tensor]:
         """Return mean distances (B,) in metres between the observations and the motion decoded from z and beta.
 
         Args:
-            seen: result of `read`.
+            observations: result of `read`.
             z: (B, Z).
             shape: (B, S).
 
         Returns:
             Mapping from "surfaces", "points" or "markers" to the distances; for points, to the nearest vertex.
         """
-        decoded = self._decode(z, shape, seen)[1]
-        return {name: (value - seen[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, value in decoded.items()}
+        decoded = self._decode(z, shape, observations)[1]
+        return {
+            name: (value - observations[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, value in decoded.items()
+        }
 
-    def guide(self, seen: Mapping[str, Any]) -> Any:
+    def guide(self, observations: Mapping[str, Any]) -> Any:
         """Sample z from the model's guide for randomly chosen known segments, one for each observed segment.
 
         Args:
-            seen: result of `read`; only the number of segments is used.
+            observations: result of `read`; only the number of segments is used.
         """
         assert self.known is not None
-        rows = torch.randint(len(self.known["x"]), (len(next(iter(seen.values()))),))
+        rows = torch.randint(len(self.known["x"]), (len(next(iter(observations.values()))),))
         return self.model.guide({name: value[rows] for name, value in self.known.items()})
 
-    def renewed(self, seen: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    def renewed(self, observations: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the observations with updated indices of the vertices nearest to points.
 
         Args:
-            seen: result of `read`.
+            observations: result of `read`.
             values: z (B, Z), and beta (B, S) unless it was observed; the points are compared with the decoded surfaces.
         """
-        if POINTS not in seen:
-            return dict(seen)
-        shape = values.get(SHAPE, seen.get(SHAPE))
-        frames, _ = self._at_moments(values[LATENT], shape, seen)
+        if POINTS not in observations:
+            return dict(observations)
+        shape = values.get(SHAPE, observations.get(SHAPE))
+        frames, _ = self._at_moments(values[LATENT], shape, observations)
         rotations, places = self.model.timed.poses(frames)
-        return {**seen, NEAREST: nearest_vertices(self.model.body, shape, rotations, places, seen[POINTS])}
+        return {
+            **observations,
+            NEAREST: nearest_vertices(self.model.body, shape, rotations, places, observations[POINTS]),
+        }
 
-    def _decode(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+    def _decode(self, z: Tensor, shape: Tensor, observations: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the times (B, K) of the moments, and the decoded counterparts of all observations by name."""
         body = self.model.body
-        frames, times = self._at_moments(z, shape, seen)
+        frames, times = self._at_moments(z, shape, observations)
         rotations, places = self.model.timed.poses(frames)
         pose, decoded = (shape, rotations, places), {}
-        if SURFACES in seen:
+        if SURFACES in observations:
             decoded[SURFACES] = body.some(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
-        if SPOTS in seen:
+        if SPOTS in observations:
             decoded[SPOTS] = body.some(*pose, torch.tensor(self.markers, device=z.device))
-        if POINTS in seen:
-            vertices = seen[NEAREST] if NEAREST in seen else nearest_vertices(body, *pose, seen[POINTS])
+        if POINTS in observations:
+            vertices = (
+                observations[NEAREST]
+                if NEAREST in observations
+                else nearest_vertices(body, *pose, observations[POINTS])
+            )
             decoded[POINTS] = body.some(*pose, vertices)
         return times, decoded
 
-    def _at_moments(self, z: Tensor, shape: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    def _at_moments(self, z: Tensor, shape: Tensor, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         """Return the frames (B, K, D) of the decoded segments at the observed moments, and their times or indices.
 
         Only the needed frames are decoded. The second result is the times (B, K) in seconds. If times were not observed
         and all segments share whole frame indices, it is these indices instead, because times are not needed.
         """
-        frames, decode = seen.get(FRAMES), self.model.decoder(z, shape)
-        if TIMES not in seen and frames is not None and bool((frames == frames[:1].round()).all()):
+        frames, decode = observations.get(FRAMES), self.model.decoder(z, shape)
+        if TIMES not in observations and frames is not None and bool((frames == frames[:1].round()).all()):
             return decode(frames[0].long()), frames
-        return _interpolate(self.model.timed.times(decode(None, TIME)), decode, seen)
+        return _interpolate(self.model.timed.times(decode(None, TIME)), decode, observations)
 
-    def read(self, seen: Mapping[str, Any]) -> dict[str, Tensor]:
+    def read(self, observations: Mapping[str, Any]) -> dict[str, Tensor]:
         """Validate observations, and convert them to the model's precision and device.
 
         Args:
-            seen: observations in the format of this module.
+            observations: values in the format of this module.
 
         Returns:
             The same observations as tensors; surfaces keep only every `THIN`-th vertex.
@@ -227,7 +240,7 @@ class SegmentCompletion:
             ValueError: a name is unknown, a shape is wrong, observations are empty, an observation has neither time nor
                 frame, a frame is out of range, or beta is NaN in some segments.
         """
-        tensors = {name: torch.as_tensor(value).to(like(self.model)) for name, value in seen.items()}
+        tensors = {name: torch.as_tensor(value).to(like(self.model)) for name, value in observations.items()}
         body, kinds = self.model.body, [name for name in (SURFACES, POINTS, SPOTS) if name in tensors]
         moments = next((tensors[name] for name in (TIMES, FRAMES) if name in tensors), None)
         if unknown := tensors.keys() - {TIMES, FRAMES, SURFACES, POINTS, SPOTS, SHAPE}:
@@ -271,12 +284,12 @@ class Completed:
 
     Args:
         program: program of the observations.
-        seen: observations, as returned by `SegmentCompletion.read`.
+        observations: observed values, as returned by `SegmentCompletion.read`.
         posterior: posterior of z, and of beta if it was unknown.
     """
 
     program: SegmentCompletion
-    seen: Mapping[str, Any]
+    observations: Mapping[str, Any]
     posterior: Posterior
 
     @property
@@ -287,7 +300,7 @@ class Completed:
     def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> IWAEBound:
         """Return the log evidence of the observations with its k-hat; arguments as in `Posterior.evidence`."""
         with evaluating(self.model):
-            return self.posterior.evidence(self.program, self.seen, particles, seed=seed, chunk=chunk)
+            return self.posterior.evidence(self.program, self.observations, particles, seed=seed, chunk=chunk)
 
     @property
     def x(self) -> Tensor:
@@ -306,13 +319,13 @@ class Completed:
     @torch.no_grad()
     def _decode(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         z = values[LATENT]
-        shape = values.get(SHAPE, self.seen.get(SHAPE)).expand(*z.shape[:-1], -1)  # type: ignore[union-attr]
+        shape = values.get(SHAPE, self.observations.get(SHAPE)).expand(*z.shape[:-1], -1)  # type: ignore[union-attr]
         return self.model.decode(z, shape), shape
 
 
 def complete(
     model: Any,
-    seen: Mapping[str, Any],
+    observations: Mapping[str, Any],
     *,
     deviations: Deviations | None = None,
     markers: Sequence[int] | None = None,
@@ -327,7 +340,7 @@ def complete(
 
     Args:
         model: model of segments, as in `SegmentCompletion`.
-        seen: observations, in the format of this module.
+        observations: values in the format of this module.
         deviations, markers, known, aggregate: same as in `SegmentCompletion`.
         descent, seed, chunk, progress: same as in `dvae.posterior`.
 
@@ -339,7 +352,7 @@ def complete(
     """
     spots = markers or tuple(MARKERS.values())
     program = SegmentCompletion(model, deviations or Deviations(), spots, known, aggregate)
-    data, guide = program.read(seen), None if known is None else program.guide
+    data, guide = program.read(observations), None if known is None else program.guide
     options: dict[str, Any] = {"descent": descent, "seed": seed, "chunk": chunk, "progress": progress}
     with evaluating(model):
         result = posterior(program, data, guide=guide, renew=program.renewed, **options)
@@ -445,7 +458,7 @@ def surfaces_at(model: Any, x: Tensor, shape: Tensor, times: Tensor) -> Tensor:
 
 
 def error_by_time(
-    model: Any, made: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor], times: Sequence[float]
+    model: Any, predictions: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor], times: Sequence[float]
 ) -> tuple[Tensor, Tensor]:
     """Return the error of predictions at given times, over all segments that are long enough.
 
@@ -453,7 +466,7 @@ def error_by_time(
 
     Args:
         model: model of segments, as in `SegmentCompletion`.
-        made, truth: predicted and true segments, each as frames (B, N, D) and shape parameters (B, S).
+        predictions, truth: predicted and true segments, each as frames (B, N, D) and shape parameters (B, S).
         times: K times in seconds from the first frame.
 
     Returns:
@@ -461,8 +474,8 @@ def error_by_time(
     """
     moments = torch.tensor(times).to(truth[0]).expand(len(truth[0]), -1)
     true_surfaces = surfaces_at(model, *truth, moments)
-    frames, _ = _at_moments(model.timed, made[0], {TIMES: moments})
-    surfaces = model.body(made[1], *model.timed.poses(frames))[0]
+    frames, _ = _at_moments(model.timed, predictions[0], {TIMES: moments})
+    surfaces = model.body(predictions[1], *model.timed.poses(frames))[0]
     errors = vertex_error(surfaces[:, :, None], true_surfaces[:, :, None])
     return errors.nanmean(0), errors.isfinite().sum(0)
 
@@ -504,50 +517,52 @@ def _standard(dimensions: int, kind: Tensor) -> Any:
     return dist.Normal(kind.new_zeros(dimensions), 1.0).to_event(1)
 
 
-def _observe(name: str, decoded: Tensor, seen: Tensor, deviation: float) -> None:
+def _observe(name: str, decoded: Tensor, observations: Tensor, deviation: float) -> None:
     """Add the normal log density of observations as one `pyro.factor` per segment.
 
     This is faster than `pyro.sample` with `obs`, which would compute a logarithm for each value.
 
     Args:
         name: name of the factor.
-        decoded: expected observations, same shape as `seen`.
-        seen: observations (B, ...), NaN where missing.
+        decoded: expected observations, same shape as `observations`.
+        observations: observed values (B, ...), NaN where missing.
         deviation: standard deviation of all values.
     """
-    observed = seen.isfinite()
-    squared_error = torch.where(observed, seen.nan_to_num(0.0) - decoded, 0.0).flatten(1).square().sum(-1)
+    observed = observations.isfinite()
+    squared_error = torch.where(observed, observations.nan_to_num(0.0) - decoded, 0.0).flatten(1).square().sum(-1)
     pyro.factor(name, -squared_error / (2 * deviation**2) - observed.flatten(1).sum(-1) * log(deviation * sqrt(2 * pi)))
 
 
-def _at_moments(timed: TimedFrames, x: Tensor, seen: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+def _at_moments(timed: TimedFrames, x: Tensor, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """Return the frames (B, K, D) at the observed moments, from frames (B, N, D), and their times (B, K) in seconds.
 
     Moments after the end use the last frame; its time then shows how much too early the segment ends.
     """
-    return _interpolate(timed.times(x), lambda frames: x if frames is None else x[:, frames], seen)
+    return _interpolate(timed.times(x), lambda frames: x if frames is None else x[:, frames], observations)
 
 
 def _interpolate(
-    decoded: Tensor, decode: Callable[[Tensor | None], Tensor], seen: Mapping[str, Any]
+    decoded: Tensor, decode: Callable[[Tensor | None], Tensor], observations: Mapping[str, Any]
 ) -> tuple[Tensor, Tensor]:
     """Return the frames (B, K, D) at the observed moments and their times (B, K), and decode only needed frames.
 
     Args:
         decoded: times (B, N) of all frames in seconds.
         decode: function from frame indices, or None for all frames, to these frames (B, n, D).
-        seen: observations with times or frames.
+        observations: observed values with times or frames.
     """
     n_frames = decoded.shape[1]
-    times = seen.get(TIMES, torch.full_like(seen[FRAMES], torch.nan) if FRAMES in seen else None)
+    times = observations.get(
+        TIMES, torch.full_like(observations[FRAMES], torch.nan) if FRAMES in observations else None
+    )
     moments = times.nan_to_num(0.0)
     before = torch.searchsorted(decoded.detach(), moments.contiguous(), right=True).sub(1).clamp(0, n_frames - 2)
     ends = torch.stack([before, before + 1], -1)
     start, end = (decoded.gather(1, columns) for columns in ends.unbind(-1))
     share = ((moments - start) / (end - start)).clamp(0, 1)
-    if FRAMES in seen:
-        frames = seen[FRAMES].nan_to_num(0.0)
-        located, around = seen[FRAMES].isfinite(), torch.stack([frames.floor(), frames.ceil()], -1)
+    if FRAMES in observations:
+        frames = observations[FRAMES].nan_to_num(0.0)
+        located, around = observations[FRAMES].isfinite(), torch.stack([frames.floor(), frames.ceil()], -1)
         ends = torch.where(located[..., None], around.long(), ends)
         share = torch.where(located, frames - around[..., 0], share)
         start, end = (decoded.gather(1, columns) for columns in ends.unbind(-1))

@@ -218,7 +218,7 @@ class SegmentData:
             return Segments(motion, self.seen, bodies=self.bodies)
         references = reference_cycles(self._embodied) if self.warped else ()
         timed, batch = TimedFrames.seeing(motion, scaling=self.scaling, references=references)
-        return Segments(motion, timed, seen=batch, bodies=self.bodies)
+        return Segments(motion, timed, frames=batch, bodies=self.bodies)
 
     @cached_property
     def _embodied(self) -> MotionSet:

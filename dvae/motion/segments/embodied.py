@@ -100,7 +100,7 @@ class Segments:
         timed: conversion to frames; for test data, the conversion of the training data. Default: estimated from
             `motion`.
         body: body with these joints; default: the bundled person.
-        seen: result of `timed.to(motion)`, if it was computed already.
+        frames: result of `timed.to(motion)`, if it was computed already.
         bodies: standard deviation of the shape parameters that `sample` draws in place of the segments' own; 0 keeps
             their own. Root positions scale with the length of the legs, as in `bodies.retarget`. A model trained on
             few bodies does not generalise to others.
@@ -114,15 +114,15 @@ class Segments:
         motion: MotionSet,
         timed: TimedFrames | None = None,
         body: Body | None = None,
-        seen: Mapping[str, Any] | None = None,
+        frames: Mapping[str, Any] | None = None,
         bodies: float = 0.0,
     ):
         self.motion, self.body, self.bodies = motion, body or human(), bodies
         if timed is None:
-            timed, seen = TimedFrames.seeing(motion)
-        self.timed, seen = timed, seen or timed.to(motion)
-        self._batch = {WHOLE: seen[WHOLE], SHAPE: shapes_of(motion, self.body).float()}
-        self._start = {name: seen[name] for name in (HEADING, ORIGIN)}
+            timed, frames = TimedFrames.seeing(motion)
+        self.timed, frames = timed, frames or timed.to(motion)
+        self._batch = {WHOLE: frames[WHOLE], SHAPE: shapes_of(motion, self.body).float()}
+        self._start = {name: frames[name] for name in (HEADING, ORIGIN)}
 
     def __len__(self) -> int:
         return len(self.motion)

@@ -186,12 +186,12 @@ class TimedFrames:
         """
         return self._scaled(self._unscaled(motion))
 
-    def back(self, seen: Mapping[str, Any], fps: float | None = None) -> MotionSet:
+    def back(self, frames: Mapping[str, Any], fps: float | None = None) -> MotionSet:
         """Convert time-stamped frames, from `to` or from a decoder, to motion.
 
         Args:
-            seen: x (B, N, D); optionally "heading", "origin" and "offsets" as returned by `to`. Defaults: heading zero,
-                origin 0, and the offsets of the skeleton's rest pose.
+            frames: x (B, N, D); optionally "heading", "origin" and "offsets" as returned by `to`. Defaults: heading
+                zero, origin 0, and the offsets of the skeleton's rest pose.
             fps: frames per second; default: the rate of the skeleton.
 
         Returns:
@@ -200,7 +200,7 @@ class TimedFrames:
         Raises:
             ValueError: x has another shape, or values that are NaN or infinite.
         """
-        skeleton, x = replace(self.skeleton, fps=fps or self.skeleton.fps), seen[WHOLE].detach().cpu().double()
+        skeleton, x = replace(self.skeleton, fps=fps or self.skeleton.fps), frames[WHOLE].detach().cpu().double()
         if not x.isfinite().all():
             raise ValueError(f"x has {int((~x.isfinite()).sum())} NaN or infinite values; all must be finite")
         rotations, places, times = self.unpack(x)
@@ -212,14 +212,14 @@ class TimedFrames:
             turned_quaternions, root_positions = _split_joined(_normalise(interpolation @ values))
             local = torch.eye(3).to(x).repeat(len(turned_quaternions), skeleton.joints, 1, 1)
             local[:, self.turning] = to_matrix(turned_quaternions, "quaternion")
-            if HEADING in seen:
+            if HEADING in frames:
                 turn, root_positions = self._rotate_root(
-                    local[:, skeleton.root], root_positions, seen[HEADING][b].cpu().double()
+                    local[:, skeleton.root], root_positions, frames[HEADING][b].cpu().double()
                 )
                 local[:, skeleton.root] = turn
-            if ORIGIN in seen:
-                root_positions = root_positions + seen[ORIGIN][b].cpu().double()
-            offsets = seen[OFFSETS][b].cpu().double() if OFFSETS in seen else skeleton.offsets
+            if ORIGIN in frames:
+                root_positions = root_positions + frames[ORIGIN][b].cpu().double()
+            offsets = frames[OFFSETS][b].cpu().double() if OFFSETS in frames else skeleton.offsets
             positions, _ = kinematics.forward(skeleton.parents, local, offsets, root_positions)
             quaternions = continuous(from_matrix(local, "quaternion"))
             clips.append(Clip("all", f"{b:04d}", positions.numpy(), rotations=quaternions.numpy()))

@@ -155,7 +155,7 @@ class Recovered:
 
 def recover(
     model: Any,
-    seen: Mapping[str, Any],
+    observations: Mapping[str, Any],
     keys: Sequence[tuple[str, str]],
     *,
     truth: Mapping[str, Any] | None = None,
@@ -169,7 +169,7 @@ def recover(
     """Complete segments, and evaluate the results.
 
     Args:
-        model, seen, deviations, known, aggregate, descent, seed, progress: same as in `complete`.
+        model, observations, deviations, known, aggregate, descent, seed, progress: same as in `complete`.
         keys: (split, name) of each segment.
         truth: true x (B, N, D) and beta (B, S), if known.
 
@@ -180,11 +180,11 @@ def recover(
     Raises:
         ValueError: same as `complete`; or a segment has no observations.
     """
-    _check_nonempty(SegmentCompletion(model).read(seen))
+    _check_nonempty(SegmentCompletion(model).read(observations))
     options: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
-    completed = complete(model, seen, **options, seed=seed, progress=progress)
+    completed = complete(model, observations, **options, seed=seed, progress=progress)
     bound = completed.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
-    distances = completed.program.distances(completed.seen, completed.posterior.mode[LATENT], completed.shape)
+    distances = completed.program.distances(completed.observations, completed.posterior.mode[LATENT], completed.shape)
     return Recovered(completed, keys, completed.draw(DRAWS, seed), bound.khat, distances, truth)
 
 
@@ -253,10 +253,12 @@ def _check_numbers(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} has a value of {far:g}; expected shape parameters, which are about N(0, 1)")
 
 
-def _check_nonempty(seen: Mapping[str, Any]) -> None:
+def _check_nonempty(observations: Mapping[str, Any]) -> None:
     """Raise an error if a segment has no observations."""
-    kinds = [seen[name].isfinite().flatten(2).any(-1) for name in (SURFACES, POINTS, SPOTS) if name in seen]
-    timed = [seen[name].isfinite() for name in (TIMES, FRAMES) if name in seen]
+    kinds = [
+        observations[name].isfinite().flatten(2).any(-1) for name in (SURFACES, POINTS, SPOTS) if name in observations
+    ]
+    timed = [observations[name].isfinite() for name in (TIMES, FRAMES) if name in observations]
     moments = torch.stack(kinds).any(0) if kinds else torch.stack(timed).all(0)
     if not (has_observations := moments.any(-1)).all():
         row = int(has_observations.logical_not().nonzero()[0])

@@ -124,16 +124,16 @@ def command(*words: str) -> Markup:
     return Markup("<code>{}</code>").format(" ".join(words))
 
 
-def tabulated(shown: RenderableType) -> Markup:
+def tabulated(table: RenderableType) -> Markup:
     """Return a rich table, or a group of them, with title and caption."""
-    if isinstance(shown, Group):
-        return Markup().join(map(tabulated, shown.renderables))
-    assert isinstance(shown, rich.table.Table)
-    rows = zip(*(column.cells for column in shown.columns), strict=True)
-    head = Markup().join(Markup("<th>{}</th>").format(_plain(column.header)) for column in shown.columns)
-    body = Markup().join(Markup("<tr>{}</tr>").format(_row(row, shown.columns)) for row in rows)
-    title = Markup("<figcaption>{}</figcaption>").format(_plain(shown.title)) if shown.title else ""
-    caption = Markup('<p class="note">{}</p>').format(_plain(shown.caption)) if shown.caption else ""
+    if isinstance(table, Group):
+        return Markup().join(map(tabulated, table.renderables))
+    assert isinstance(table, rich.table.Table)
+    rows = zip(*(column.cells for column in table.columns), strict=True)
+    head = Markup().join(Markup("<th>{}</th>").format(_plain(column.header)) for column in table.columns)
+    body = Markup().join(Markup("<tr>{}</tr>").format(_row(row, table.columns)) for row in rows)
+    title = Markup("<figcaption>{}</figcaption>").format(_plain(table.title)) if table.title else ""
+    caption = Markup('<p class="note">{}</p>').format(_plain(table.caption)) if table.caption else ""
     return Markup('<figure>{}<div class="wide"><table><tr>{}</tr>{}</table></div>{}</figure>').format(
         title, head, body, caption
     )

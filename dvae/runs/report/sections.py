@@ -284,10 +284,10 @@ def prediction_bands(runs: Runs) -> Section:
     return Section("Prediction bands around forecasts", cells(runs, cell), explanation)
 
 
-def edges(found: Ablation) -> Section:
+def edges(ablation: Ablation) -> Section:
     """Return the section with the cost of every edge of a model and its guide."""
-    plot = picture(found.plot(), "model and guide of one step, edges as thick as their cost")
-    return Section("Cost of every edge", before=plot + tabulated(found.table()))
+    plot = picture(ablation.plot(), "model and guide of one step, edges as thick as their cost")
+    return Section("Cost of every edge", before=plot + tabulated(ablation.table()))
 
 
 # ------------------------------------------------------------------------------------------ sections that need windows

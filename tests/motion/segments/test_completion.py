@@ -111,7 +111,7 @@ def test_decoded_segments_are_recovered(model, kind, options):
         assert chamfer(observed["points"], energy).mean() < 1.5 * chamfer(observed["points"], true_energy).mean()
     else:
         truth = poutine.condition(SegmentCompletion(model), data={"z": z, SHAPE: shape})
-        trace = poutine.trace(truth).get_trace(completed.seen)
+        trace = poutine.trace(truth).get_trace(completed.observations)
         assert completed.posterior.energy.sum() <= -trace.log_prob_sum()
         error = bodies.vertex_error(model.vertices(completed.x, completed.shape), model.vertices(x, shape))
         assert error.max() < 0.02
