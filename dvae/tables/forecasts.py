@@ -102,7 +102,7 @@ class PanelForecasts:
             self.fan(axis, window, name)
             unit = self.columns[name]
             axis.set_title(name + (f" ({unit})" if unit else ""), fontsize=9, parse_math=False)
-            axis.tick_params(labelsize=7)
+            axis.tick_params(labelsize=8)
         for axis in panels[len(selected) :]:
             axis.set_axis_off()
         for axis in panels[max(len(selected) - n_columns, 0) : len(selected)]:  # the lowest panel of each column

@@ -187,7 +187,7 @@ class Bracket(Result):
             lower = self.estimate("AIS", "ELBO", data).mean
             shade = {"real": "as wide as on simulated data", "simulated": "evidence"}[data]
             panel.axvspan(lower, lower + max(unknown, 0.0), color="C2", alpha={"real": 0.15, "simulated": 0.35}[data])
-            panel.annotate(shade, (lower, 1), xycoords=("data", "axes fraction"), fontsize=7, va="bottom")
+            panel.annotate(shade, (lower, 1), xycoords=("data", "axes fraction"), fontsize=8, va="bottom")
             for place, (part, (low, high)) in enumerate(PARTS.items()):
                 if part in self.gap(data) and part != "unknown":
                     ends = [self.estimate(name, "ELBO", data).mean for name in (low, high)]

@@ -169,7 +169,7 @@ class Calibration(Result):
             bottom.axhline(0, color="0.4", linewidth=0.8)
             bottom.tick_params(labelbottom=True)
             for panel in (top, bottom):
-                panel.tick_params(labelsize=7)
+                panel.tick_params(labelsize=8)
             if column == 0:
                 top.set_ylabel("ranks\n/ uniform", fontsize=8)
                 bottom.set_ylabel("ECDF\n− uniform", fontsize=8)

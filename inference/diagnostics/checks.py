@@ -273,7 +273,7 @@ class PredictiveChecks(Result):
                     replicated = self.checks[model, program, name].replicated
                     panel.stairs(_density(replicated, edges), edges, color=f"C{place}", label=model, linewidth=1.3)
                 panel.set_yticks([])
-                panel.tick_params(labelsize=7)
+                panel.tick_params(labelsize=8)
             unit = checks[0].unit
             panels[-1, column].set_xlabel(f"{name} ({unit})" if unit else name, fontsize=9, parse_math=False)
         for row, program in enumerate(programs):

@@ -290,8 +290,8 @@ class ReferencePosterior(Result):
             panel.set_xlabel("step" if local else "coordinate", fontsize=8)
             panel.set_xlim(across[0] - 0.5, across[-1] + 0.5)
             panel.xaxis.get_major_locator().set_params(integer=True)
-            panel.tick_params(labelsize=7)
-        top.axes[0].legend(fontsize=7)
+            panel.tick_params(labelsize=8)
+        top.axes[0].legend(fontsize=8)
         scatter, *images = bottom.subplots(1, 3)
         for place, name in enumerate(self.shapes):
             mask = latent == place
@@ -302,13 +302,13 @@ class ReferencePosterior(Result):
         scatter.plot(ends, ends, color="0.4", linewidth=0.8)
         scatter.set_xlabel("deviation, reference", fontsize=8)
         scatter.set_ylabel("deviation, guide", fontsize=8)
-        scatter.tick_params(labelsize=7)
-        scatter.legend(fontsize=7)
+        scatter.tick_params(labelsize=8)
+        scatter.legend(fontsize=8)
         for panel, part, called in zip(images, (self.reference, self.guide), ("reference", "guide"), strict=True):
             image = panel.imshow(part.correlation[sequence], cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
             panel.set_title(f"correlations, {called}", fontsize=8)
-            panel.tick_params(labelsize=7)
-        figure.colorbar(image, ax=images, shrink=0.8).ax.tick_params(labelsize=7)
+            panel.tick_params(labelsize=8)
+        figure.colorbar(image, ax=images, shrink=0.8).ax.tick_params(labelsize=8)
         title = f"sequence {self.sequences[sequence]} · {self.equations.get('inference', 'custom guide')}"
         figure.suptitle(f"{title}\n{self.verdict}", fontsize=9, parse_math=False)
         return figure

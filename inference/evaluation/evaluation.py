@@ -244,7 +244,7 @@ class Evaluation(Result):
             bottom.plot(points, difference, color="C0", linewidth=1.2)
             bottom.axhline(0, color="0.4", linewidth=0.8)
             for panel in (top, bottom):
-                panel.tick_params(labelsize=7)
+                panel.tick_params(labelsize=8)
         panels[0, 0].set_ylim(bottom=0)
         panels[0, 0].set_ylabel(f"{histogram}\n/ uniform", fontsize=8, parse_math=False)
         panels[1, 0].set_ylabel("ECDF\n− uniform", fontsize=8)
@@ -296,7 +296,7 @@ class Evaluation(Result):
             coverage_panel.set_ylim(0, 1)
             coverage_panel.set_title(f"coverage by {frame}", fontsize=8, parse_math=False)
         for panel in panels.flat:
-            panel.tick_params(labelsize=7)
+            panel.tick_params(labelsize=8)
         figure.suptitle(self._title(), fontsize=9, parse_math=False)
         return figure
 

@@ -222,6 +222,14 @@ def test_records_of_a_run_are_reported(scored, tmp_path):
     assert main(["report", str(scored), "--out", "a.html", "--edges", str(tmp_path / "none.json")]) == 2
 
 
+def test_bounds_omit_scores_that_are_shown_above(fitted, scored):
+    few = sections.SelectedWindows(dvae.load(fitted).data.windows("test"), 3)
+    unscored, omitted = (document("a", [sections.weighed({"a": dvae.load(run)}, few, 4)]) for run in (fitted, scored))
+    assert "ELBO ↑" in unscored
+    assert "ELBO ↑" not in omitted
+    assert "IWAE bound" in omitted
+
+
 def test_scores_of_an_older_state_of_the_run_are_marked(scored, tmp_path):
     run = shutil.copytree(scored, tmp_path / "run")
     config = json.loads((run / "config.json").read_text())

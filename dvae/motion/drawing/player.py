@@ -208,8 +208,8 @@ def animate(
 ) -> Animation:
     """Return an animation of skeletons to play, seek and rotate: the true motion, and sampled futures.
 
-    All people repeat the observed motion in black and continue in the colours of `plot.futures`, seen from the same
-    side. Time zero is the last observed pose.
+    All people repeat the observed motion in black (white in dark mode) and continue in the colours of `plot.futures`,
+    seen from the same side. Time zero is the last observed pose.
 
     Args:
         skeleton: skeleton of the poses.
