@@ -141,9 +141,8 @@ def tabulated(shown: RenderableType, omitted: Sequence[str] = ()) -> Markup:
     caption = Markup('<p class="note">{}</p>').format(_plain(shown.caption)) if shown.caption else ""
     others = ""
     if more := columns[COLUMNS:]:
-        others = Markup("<details><summary>{} more columns</summary>{}</details>").format(
-            len(more), _table([columns[0], *more])
-        )
+        label = f"{len(more)} more column{'s' * (len(more) > 1)}"
+        others = Markup("<details><summary>{}</summary>{}</details>").format(label, _table([columns[0], *more]))
     return Markup("<figure>{}{}{}{}</figure>").format(title, _table(columns[:COLUMNS]), others, caption)
 
 

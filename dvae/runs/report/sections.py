@@ -277,7 +277,14 @@ def prediction_bands(runs: Runs) -> Section:
             return _missing(run, "coverage.json", "prediction bands around forecasts", "check coverage")
         bands, test_record = PredictionBands.from_json(text), _record(run, "coverage-test.json")
         content = picture(bands.plot(), "factors over the horizon") + tabulated(bands.table())
-        return content + (tabulated(Evaluation.from_json(test_record).table()) if test_record is not None else "")
+        if test_record is None:
+            return content
+        evaluation = Evaluation.from_json(test_record)
+        for name in [name for name, metric in evaluation.metrics.items() if metric.program == "teacher-forced"]:
+            del evaluation.metrics[name]  # other sections show them
+            for row in evaluation.rows.values():
+                row.clip_means.pop(name, None)
+        return content + tabulated(evaluation.table())
 
     explanation = (
         "Factors by which forecasts are widened to reach the given coverage, and the coverage on other windows."
