@@ -310,7 +310,8 @@ def animate(
 ) -> None:
     """Play forecasts next to the true future, or a clip, as moving skeletons.
 
-    The page is a single file that any browser shows without a network. It can play, scrub, and turn with the mouse.
+    The page is a single file that any browser shows without a network. Skeletons play, and turn with the mouse, a
+    finger or the arrow keys.
 
     Args:
         source: run directory, file written by `dvae forecast`, motion file, or "simulated".

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from .. import files
 from ..inference.evaluation.result import error_message, progress_bar
 from ..inference.training.checkpoints import CheckpointError
-from ..motion.drawing.player import SCRIPT, player
+from ..motion.drawing.player import SCRIPT, STYLE, controls, stage
 from ..motion.drawing.plot import make_scene
 from ..runs import directory as runs
 from ..runs.ablation import Ablation
@@ -27,10 +27,10 @@ from .futures import draw_futures
 
 OF_DIRECTORIES = (
     sections.overview,
+    sections.evaluated,
     sections.equations,
     sections.graphs,
     sections.curves,
-    sections.evaluated,
     sections.calibration,
     sections.bracketed,
     sections.reference_posteriors,
@@ -92,7 +92,7 @@ def report(
         test: Any = data_set.windows("test")
     except CheckpointError as error:
         text = f"Bounds, latents and futures need the data. {error_message(error)}; give their path with --data."
-        page_sections.append(Section("Latents and futures", before=missing_part(text)))
+        page_sections.insert(1, Section("Latents and futures", before=missing_part(text)))
     else:
         selected = sections.SelectedWindows(test, bound_windows)
         page_sections += [
@@ -100,8 +100,9 @@ def report(
             sections.posteriors(by_name, selected, seed),
         ]
         futures = _fans if of_table else _futures
-        page_sections += [futures(by_name, test, windows, samples, seed)] if windows else []
-    text = document("Report: " + ", ".join(by_name), page_sections, [] if of_table else [SCRIPT])
+        page_sections[1:1] = [futures(by_name, test, windows, samples, seed)] if windows else []
+    player = () if of_table else ([SCRIPT], STYLE)
+    text = document("Report: " + ", ".join(by_name), page_sections, *player)
     with files.atomic_write(out) as file:
         file.write(text.encode(errors="replace"))
     ERROR.print(f"wrote {out}: {', '.join(by_name)}, {len(text) / 1e6:.1f} MB")
@@ -139,17 +140,12 @@ def _futures(by_name: Mapping[str, Any], windows: Any, count: int, samples: int,
     def cell(run: runs.Loaded) -> Markup:
         futures = draw_futures(run, windows, selected.chosen, samples, seed)
         names = [str(k + 1) for k in range(samples)]
-        scenes = {
-            f"{split}/{clip} from frame {start}": make_scene(
-                futures.skeleton, futures.observed[n], futures.forecasts[:, n], futures.truth[n], names=names
-            )
-            for n, (split, clip, start) in enumerate(futures.keys)
-        }
-        return player(scenes)
+        motions = futures.observed, futures.forecasts.swapaxes(0, 1), futures.truth
+        return stage([make_scene(futures.skeleton, *each, names=names) for each in zip(*motions, strict=True)])
 
     caption = (
-        f"Black: observed. Green: true future. In colour: {samples} futures, each from one draw of the latents. "
-        "Models with latents show the mean of the emission, without its noise. Drag a skeleton, or press the arrow "
-        "keys, to turn it."
+        f"Without colour: observed. Green: true future. Other colours: {samples} futures, each from one draw of the "
+        "latents. Models with latents show the mean of the emission, without its noise."
     )
-    return Section("Futures", sections.cells(by_name, cell, "futures"), caption)
+    titles = [f"{split}/{clip} from frame {start}" for split, clip, start in selected.keys]
+    return Section("Futures", sections.cells(by_name, cell, "futures"), caption, controls(titles))

@@ -1,7 +1,9 @@
-// Skeletons on a canvas: play, scrub, turn. What moves is in data-motion of each .player; see player.py for its form.
+// Skeletons on canvases: play, scrub, turn. The .controls move all .stage elements of their parent together.
+// Each stage has its scenes in data-motion; see player.py for their form.
 'use strict';
 
-const MISSING = -32768, SMALLEST = 64, NAME = 15, THICK = .02, WAYS = {ArrowLeft: -1, ArrowRight: 1};
+const MISSING = -32768, SMALLEST = 64, NAME = 17, THICK = .02;
+const TURNS = {ArrowLeft: [-.26, 0], ArrowRight: [.26, 0], ArrowUp: [0, .1], ArrowDown: [0, -.1]};
 
 const unpacked = async text => {
   const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
@@ -29,24 +31,44 @@ const opened = async scene => {
   return {...scene, people, values, at};
 };
 
-const play = async box => {
-  const scenes = JSON.parse(box.dataset.motion), canvas = box.querySelector('canvas'), pen = canvas.getContext('2d');
-  const [button, select, slider, time] = ['button', 'select', 'input', 'output'].map(name => box.querySelector(name));
-  let scene, frame, started = null, turn = 0, tilt = .2, wide = canvas.clientWidth;
+const play = async controls => {
+  const [button, select, slider, time] = ['button', 'select', 'input', 'output'].map(name => controls.querySelector(name));
+  const stages = [...controls.parentElement.querySelectorAll('.stage')].map(canvas =>
+    ({canvas, pen: canvas.getContext('2d'), scenes: JSON.parse(canvas.dataset.motion)}));
+  controls.hidden = !stages.length;
+  if (!stages.length) return;
+  const width = () => Math.min(...stages.map(stage => stage.canvas.clientWidth));
+  let scenes, view, frame, started = null, turn = 0, tilt = .2, wide = width();
+
+  // One scale and one camera for all stages.
+  const together = () => {
+    const [{middle, milliseconds, observed}] = scenes, most = of => Math.max(...scenes.map(of));
+    return {middle, milliseconds, observed, frames: most(scene => scene.frames), count: most(scene => scene.people.length),
+      low: -most(scene => -scene.low), high: most(scene => scene.high),
+      reach: most(scene => scene.reach + Math.hypot(scene.middle[0] - middle[0], scene.middle[1] - middle[1]))};
+  };
 
   const draw = () => {
-    const {people, bones, values, at, unit, middle, reach, low, high, observed} = scene;
+    const {count, reach, low, high, observed, milliseconds} = view;
     const [right, up] = [2 * reach, (high - low) * Math.cos(tilt) + 2 * reach * Math.abs(Math.sin(tilt))];
     const most = Math.max(240, .7 * innerHeight);
     let columns = 1, scale = 0;
-    for (let tried = 1; tried <= people.length; tried++) {  // as large as can be, in one window of the browser
-      const fits = Math.min(wide / tried / right, (most / Math.ceil(people.length / tried) - NAME) / up);
+    for (let tried = 1; tried <= count; tried++) {  // as large as can be, in one window of the browser
+      const fits = Math.min(wide / tried / right, (most / Math.ceil(count / tried) - NAME) / up);
       if (fits > scale) [columns, scale] = [tried, fits];
     }
     if (right * scale < SMALLEST) {  // or as small as may be, and higher than it
-      columns = Math.max(1, Math.min(people.length, Math.floor(wide / SMALLEST)));
+      columns = Math.max(1, Math.min(count, Math.floor(wide / SMALLEST)));
       scale = Math.min(wide / columns / right, most / up);
     }
+    stages.forEach((stage, n) => drawStage(stage, scenes[n], columns, scale, up));
+    slider.value = frame;
+    const seconds = (frame - observed + 1) * milliseconds / 1000;
+    time.textContent = slider.ariaValueText = `${seconds < 0 ? '−' : '+'}${Math.abs(seconds).toFixed(2)} s`;
+  };
+
+  const drawStage = ({canvas, pen}, scene, columns, scale, up) => {
+    const {people, bones, values, at, unit, observed} = scene, {middle, reach, low, high} = view;
     const rows = Math.ceil(people.length / columns), [w, h] = [wide / columns, up * scale + NAME];
     const sharp = devicePixelRatio || 1, [across, down] = [wide * sharp, rows * h * sharp].map(Math.round);
     if (canvas.width !== across || canvas.height !== down) {
@@ -55,15 +77,16 @@ const play = async box => {
     }
     pen.setTransform(sharp, 0, 0, sharp, 0, 0);
     pen.clearRect(0, 0, wide, rows * h);
-    Object.assign(pen, {lineCap: 'round', lineJoin: 'round', font: '11px system-ui, sans-serif', textAlign: 'center'});
+    Object.assign(pen, {lineCap: 'round', lineJoin: 'round', font: '12px system-ui, sans-serif', textAlign: 'center'});
 
     const [c, s, ct, st] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
-    const before = Math.floor(frame), after = Math.ceil(frame), share = frame - before, half = (low + high) / 2;
+    const now = Math.min(frame, scene.frames - 1), before = Math.floor(now), after = Math.ceil(now);
+    const share = now - before, half = (low + high) / 2;
     people.forEach((person, k) => {
       const [x0, y0] = [(k % columns + .5) * w, Math.floor(k / columns) * h + NAME + up * scale / 2];
       const seen = (x, y, z) => [x0 + scale * (c * x - s * y), y0 - scale * ((z - half) * ct + (s * x + c * y) * st)];
       const line = (...points) => points.forEach((point, i) => i ? pen.lineTo(...seen(...point)) : pen.moveTo(...seen(...point)));
-      pen.strokeStyle = '#dfe2e6';
+      pen.strokeStyle = '#999';
       pen.lineWidth = 1;
       pen.beginPath();
       line(...[[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]].map(([x, y]) => [.6 * reach * x, .6 * reach * y, low]));
@@ -89,32 +112,29 @@ const play = async box => {
         pen.stroke();
       }
     });
-    slider.value = frame;
-    const seconds = (frame - observed + 1) * scene.milliseconds / 1000;
-    time.textContent = `${seconds < 0 ? '−' : '+'}${Math.abs(seconds).toFixed(2)} s`;
   };
 
   const stop = () => { started = null; button.textContent = 'Play'; };
   const move = now => {
     if (started === null) return;
-    frame = Math.min(scene.frames - 1, Math.max(0, (now - started) / scene.milliseconds));
-    if (frame === scene.frames - 1) stop();
+    frame = Math.min(view.frames - 1, Math.max(0, (now - started) / view.milliseconds));
+    if (frame === view.frames - 1) stop();
     draw();
     requestAnimationFrame(move);
   };
   const show = async () => {
     stop();
-    scene = await opened(scenes[select.value]);
-    slider.max = scene.frames - 1;
-    frame = scene.frames - 1;
+    scenes = await Promise.all(stages.map(stage => opened(stage.scenes[select.value])));
+    view = together();
+    slider.max = frame = view.frames - 1;
     draw();
-    box.dataset.frames = scene.frames;
+    controls.dataset.frames = view.frames;
   };
 
   button.addEventListener('click', () => {
     if (started !== null) return stop();
-    if (frame >= scene.frames - 1) frame = 0;
-    started = performance.now() - frame * scene.milliseconds;
+    if (frame >= view.frames - 1) frame = 0;
+    started = performance.now() - frame * view.milliseconds;
     button.textContent = 'Pause';
     requestAnimationFrame(move);
   });
@@ -125,21 +145,33 @@ const play = async box => {
     tilt = Math.min(1.5, Math.max(-.2, tilt + down));
     draw();
   };
-  canvas.addEventListener('pointerdown', event => canvas.setPointerCapture(event.pointerId));
-  canvas.addEventListener('pointermove', event => {
-    if (event.buttons) turned(event.movementX / 100, event.movementY / 200);
-  });
-  canvas.addEventListener('keydown', event => {
-    if (event.key in WAYS) turned(WAYS[event.key] * Math.PI / 12, 0);
-  });
+  for (const {canvas} of stages) {
+    let last = null;
+    canvas.addEventListener('pointerdown', event => {
+      canvas.setPointerCapture(event.pointerId);
+      last = event;
+    });
+    canvas.addEventListener('pointermove', event => {
+      if (!last || !event.buttons) return;
+      turned((event.clientX - last.clientX) / 100, (event.clientY - last.clientY) / 200);
+      last = event;
+    });
+    canvas.addEventListener('keydown', event => {
+      if (event.key === ' ') button.click();
+      else if (event.key in TURNS) turned(...TURNS[event.key]);
+      else return;
+      event.preventDefault();
+    });
+  }
   await show();
-  new ResizeObserver(() => {
-    if (canvas.clientWidth === wide) return;
-    wide = canvas.clientWidth;
+  const resized = new ResizeObserver(() => {
+    if (width() === wide) return;
+    wide = width();
     draw();
-  }).observe(canvas);
+  });
+  stages.forEach(({canvas}) => resized.observe(canvas));
 };
 
-document.querySelectorAll('.player').forEach(box => play(box).catch(error => {
-  box.querySelector('output').textContent = `cannot be played here: ${error.message}`;
+document.querySelectorAll('.controls').forEach(controls => play(controls).catch(error => {
+  controls.querySelector('output').textContent = `cannot be played here: ${error.message}`;
 }));

@@ -13,7 +13,7 @@ import hashlib
 import io
 import json
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from math import pi
 from os import PathLike
@@ -30,35 +30,54 @@ from ..geometry.skeleton import Skeleton
 from .plot import FIXED, PAST, Scene, make_scene
 
 SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
-"""Script that animates all players of a page."""
+"""Script of a page with players: controls, and stages that they move together."""
+
+STYLE = Path(__file__).with_name("player.css").read_text(encoding="utf-8")
+"""Style of players."""
 
 MILLIMETRE = 1e-3
 
 MISSING = -32768
 """Integer that stands for an unknown coordinate."""
 
-_PLAYER = Markup(
-    '<div class="player" data-motion="{motion}">'
-    '<p class="controls"><button type="button">Play</button>'
+_CONTROLS = Markup(
+    '<div class="controls"><button type="button">Play</button>'
     '<input type="range" min="0" max="1" value="0" step="any" aria-label="time">'
-    '<output></output><select aria-label="window">{windows}</select></p>'
-    '<canvas tabindex="0" aria-label="moving skeletons; drag, or press the arrow keys, to turn them"></canvas></div>'
+    '<output></output><select aria-label="window"{}>{}</select></div>'
 )
 _OPTION = Markup('<option value="{}">{}</option>')
+_STAGE = Markup(
+    '<canvas class="stage" data-motion="{}" tabindex="0" role="img" '
+    'aria-label="moving skeletons; drag, or press the arrow keys, to turn them"></canvas><p class="note">{}</p>'
+)
 
 
-def player(scenes: Mapping[str, Scene]) -> Markup:
-    """Return the HTML of scenes by title, shown one at a time; the page must contain `SCRIPT` once."""
-    motion = json.dumps(list(map(_scene, scenes.values())), separators=(",", ":"), allow_nan=False)
-    windows = Markup().join(_OPTION.format(index, title) for index, title in enumerate(scenes))
-    return _PLAYER.format(motion=motion, windows=windows)
+def controls(titles: Collection[str]) -> Markup:
+    """Return the HTML of the controls of all stages in the same element; the page must contain `SCRIPT` once.
+
+    Args:
+        titles: titles of the scenes, the same for all stages; one scene is shown at a time.
+    """
+    windows = Markup().join(_OPTION.format(index, title) for index, title in enumerate(titles))
+    return _CONTROLS.format(Markup(" hidden") if len(titles) == 1 else "", windows)
 
 
-def _scene(stage: Scene) -> dict[str, Any]:
+def stage(scenes: Sequence[Scene]) -> Markup:
+    """Return the HTML of scenes, shown one at a time as the `controls` select."""
+    motion = [_scene(scene) for scene in scenes]
+    rounding, fps = max(1000 * scene["unit"] for scene in motion), scenes[0].skeleton.fps
+    note = (
+        f"Positions are rounded to {rounding:.2g} mm; {fps / scenes[0].frames.step:.3g} of {fps:.3g} frames per second "
+        "are stored. Drag a skeleton, or press the arrow keys, to turn it."
+    )
+    return _STAGE.format(json.dumps(motion, separators=(",", ":"), allow_nan=False), note)
+
+
+def _scene(scene: Scene) -> dict[str, Any]:
     """Return a scene in the format of the script, with packed coordinates."""
-    motion = stage.motion[:, stage.frames]
-    observed = sum(frame <= stage.now for frame in stage.frames)
-    low, high = stage.low, stage.high
+    motion = scene.motion[:, scene.frames]
+    observed = sum(frame <= scene.now for frame in scene.frames)
+    low, high = scene.low, scene.high
     unit = max(MILLIMETRE, np.abs([low, high]).max() / 32767)
     past, future = np.split(np.nan_to_num(np.round(motion / unit), nan=MISSING), [observed], axis=1)
     ends = [np.flatnonzero((ahead != MISSING).any((1, 2))).max(initial=-1) + 1 for ahead in future]
@@ -67,14 +86,14 @@ def _scene(stage: Scene) -> dict[str, Any]:
     pieces += [np.diff(ahead, axis=0, prepend=past[0, -1:]) for ahead in futures]
     middle = (low + high) / 2
     return {
-        "joints": stage.skeleton.joints,
-        "bones": stage.skeleton.edges,
+        "joints": scene.skeleton.joints,
+        "bones": scene.skeleton.edges,
         "observed": observed,
-        "frames": len(stage.frames),
-        "milliseconds": stage.milliseconds,
+        "frames": len(scene.frames),
+        "milliseconds": scene.milliseconds,
         "people": [
-            {"name": name, "colour": colour, "frames": len(ahead), "fixed": sorted(stage.shared(k))}
-            for k, (name, colour, ahead) in enumerate(zip(stage.names, stage.colours, futures, strict=True))
+            {"name": name, "colour": colour, "frames": len(ahead), "fixed": sorted(scene.shared(k))}
+            for k, (name, colour, ahead) in enumerate(zip(scene.names, scene.colours, futures, strict=True))
         ],
         "dark": FIXED,
         "past": PAST,
@@ -113,8 +132,11 @@ class Animation:
     def to_html(self) -> str:
         """Return an HTML page that loads no other files and runs only the player's script."""
         allowed = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
-        moving = player({self.title or "motion": self.scene})
-        return str(_PAGE.format(title=self.title, policy=allowed, player=moving, script=Markup(SCRIPT)))
+        heading = Markup("<h1>{}</h1>").format(self.title) if self.title else ""
+        moving = heading + controls(["motion"]) + stage([self.scene])
+        return str(
+            _PAGE.format(title=self.title, policy=allowed, style=Markup(STYLE), player=moving, script=Markup(SCRIPT))
+        )
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the HTML page of `to_html` to a file."""
@@ -160,10 +182,11 @@ _PAGE = Markup(
 <meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy"
  content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{policy}'">
+<meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title>
 <style>
-body {{font: 14px system-ui, sans-serif; margin: 1em}}
-.controls {{display: flex; gap: 1em}} .controls input {{flex: 1}} canvas {{width: 100%}}
+body {{font: 15px/1.5 system-ui, sans-serif; margin: 1em}} h1 {{font-size: 20px; margin: 0; overflow-wrap: anywhere}}
+{style}
 </style>
 </head>
 <body>
@@ -189,8 +212,8 @@ def animate(
 ) -> Animation:
     """Return an animation of skeletons to play, seek and rotate: the true motion, and sampled futures.
 
-    All people repeat the observed motion in black and continue in the colours of `plot.futures`, seen from the same
-    side. Time zero is the last observed pose.
+    All people repeat the observed motion in black (white in dark mode) and continue in the colours of `plot.futures`,
+    seen from the same side. Time zero is the last observed pose.
 
     Args:
         skeleton: skeleton of the poses.

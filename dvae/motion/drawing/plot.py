@@ -281,8 +281,8 @@ def _places(people: int, step: np.ndarray) -> np.ndarray:
 
 
 def _colours(samples: int) -> np.ndarray:
-    """Return a colour (RGBA) for each sample, (K, 4)."""
-    return plt.get_cmap("turbo")(np.linspace(0.05, 0.95, samples))
+    """Return a colour (RGBA) for each sample, (K, 4), which colour-blind readers can order by brightness."""
+    return plt.get_cmap("plasma")(np.linspace(0.1, 0.72, samples))
 
 
 def final_heading(skeleton: Skeleton, positions: Tensor) -> float:

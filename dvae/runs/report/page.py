@@ -30,7 +30,8 @@ DPI = 160
 COLOURS = 64
 """Number of colours of a picture."""
 
-_SHRINK = 0.6  # smallest scale of a picture in a narrow window, before it scrolls
+COLUMNS = 6
+"""Number of columns of a table at first sight, with the names of its rows; a click opens the others."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,14 @@ class Section:
     before: str = ""
 
 
-def document(title: str, sections: Sequence[Section], scripts: Sequence[str] = ()) -> str:
+def document(title: str, sections: Sequence[Section], scripts: Sequence[str] = (), style: str = "") -> str:
     """Return the page.
 
     Args:
         title: title of the page.
         sections: sections from top to bottom.
         scripts: scripts of the page, which must not come from a run.
+        style: further style sheet.
     """
     hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     allowed = " ".join(f"'sha256-{digest}'" for digest in hashes) or "'none'"
@@ -66,7 +68,7 @@ def document(title: str, sections: Sequence[Section], scripts: Sequence[str] = (
     return _PAGE.format(
         title=title,
         policy=f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}",
-        style=Markup(STYLE),
+        style=Markup(STYLE + style),
         links=links,
         sections=Markup().join(_section(n, section) for n, section in enumerate(sections)),
         scripts=Markup().join(Markup("<script>{}</script>").format(Markup(script)) for script in scripts),
@@ -124,19 +126,31 @@ def command(*words: str) -> Markup:
     return Markup("<code>{}</code>").format(" ".join(words))
 
 
-def tabulated(table: RenderableType) -> Markup:
-    """Return a rich table, or a group of them, with title and caption."""
+def tabulated(table: RenderableType, omitted: Sequence[str] = ()) -> Markup:
+    """Return a rich table, or a group of them, with title and caption.
+
+    Args:
+        table: table or group of tables.
+        omitted: starts of the headers of columns to omit.
+    """
     if isinstance(table, Group):
-        return Markup().join(map(tabulated, table.renderables))
+        return Markup().join(tabulated(each, omitted) for each in table.renderables)
     assert isinstance(table, rich.table.Table)
-    rows = zip(*(column.cells for column in table.columns), strict=True)
-    head = Markup().join(Markup("<th>{}</th>").format(_plain(column.header)) for column in table.columns)
-    body = Markup().join(Markup("<tr>{}</tr>").format(_row(row, table.columns)) for row in rows)
+    columns = [column for column in table.columns if not _plain(column.header).startswith(tuple(omitted))]
     title = Markup("<figcaption>{}</figcaption>").format(_plain(table.title)) if table.title else ""
     caption = Markup('<p class="note">{}</p>').format(_plain(table.caption)) if table.caption else ""
-    return Markup('<figure>{}<div class="wide"><table><tr>{}</tr>{}</table></div>{}</figure>').format(
-        title, head, body, caption
-    )
+    others = ""
+    if more := columns[COLUMNS:]:
+        label = f"{len(more)} more column{'s' * (len(more) > 1)}"
+        others = Markup("<details><summary>{}</summary>{}</details>").format(label, _table([columns[0], *more]))
+    return Markup("<figure>{}{}{}{}</figure>").format(title, _table(columns[:COLUMNS]), others, caption)
+
+
+def _table(columns: Sequence[rich.table.Column]) -> Markup:
+    rows = zip(*(column.cells for column in columns), strict=True)
+    head = Markup().join(Markup("<th>{}</th>").format(_plain(column.header)) for column in columns)
+    body = Markup().join(Markup("<tr>{}</tr>").format(_row(row, columns)) for row in rows)
+    return Markup('<div class="wide"><table><tr>{}</tr>{}</table></div>').format(head, body)
 
 
 def _row(cells: Sequence[RenderableType], columns: Sequence[rich.table.Column]) -> Markup:
@@ -168,11 +182,8 @@ def picture(figure: Figure, about: str) -> Markup:
         image.convert("RGB").quantize(COLOURS).save(small, format="png", optimize=True)
     width, height = (96 * figure.get_size_inches()).round().astype(int).tolist()
     return Markup(
-        '<div class="wide"><img src="data:image/png;base64,{}" width="{}" height="{}" style="min-width:{}px" alt="{}">'
-        "</div>"
-    ).format(
-        base64.b64encode(small.getvalue()).decode(), width, height, min(width, max(round(_SHRINK * width), 280)), about
-    )
+        '<div class="wide"><img src="data:image/png;base64,{}" width="{}" height="{}" alt="{}"></div>'
+    ).format(base64.b64encode(small.getvalue()).decode(), width, height, about)
 
 
 def side_by_side(*parts: Markup) -> Markup:

@@ -9,6 +9,7 @@ import json
 import math
 import shlex
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -31,7 +32,7 @@ from ...inference.diagnostics.stein import SteinDiscrepancy
 from ...inference.evaluation.compare import compare
 from ...inference.evaluation.comparison import KHAT, Comparison
 from ...inference.evaluation.conformal import PredictionBands
-from ...inference.evaluation.evaluation import ARROWS, Evaluation
+from ...inference.evaluation.evaluation import Evaluation
 from ...inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from ...inference.evaluation.record import plain
 from ...inference.evaluation.result import Table, error_message, literal_text, new_figure, progress_bar
@@ -117,8 +118,8 @@ class SelectedWindows:
 
 
 def overview(runs: Runs) -> Section:
-    """Return the section with facts and scores of the runs, a column for each run."""
-    columns = {name: {**_facts(run), **_scores(run)} for name, run in runs.items()}
+    """Return the section with facts about the runs, a column for each run."""
+    columns = {name: _facts(run) for name, run in runs.items()}
     table = Table()
     for name in ("", *columns):
         table.add_column(name)
@@ -276,7 +277,14 @@ def prediction_bands(runs: Runs) -> Section:
             return _missing(run, "coverage.json", "prediction bands around forecasts", "check coverage")
         bands, test_record = PredictionBands.from_json(text), _record(run, "coverage-test.json")
         content = picture(bands.plot(), "factors over the horizon") + tabulated(bands.table())
-        return content + (tabulated(Evaluation.from_json(test_record).table()) if test_record is not None else "")
+        if test_record is None:
+            return content
+        evaluation = Evaluation.from_json(test_record)
+        for name in [name for name, metric in evaluation.metrics.items() if metric.program == "teacher-forced"]:
+            del evaluation.metrics[name]  # other sections show them
+            for row in evaluation.rows.values():
+                row.clip_means.pop(name, None)
+        return content + tabulated(evaluation.table())
 
     explanation = (
         "Factors by which forecasts are widened to reach the given coverage, and the coverage on other windows."
@@ -294,7 +302,10 @@ def edges(ablation: Ablation) -> Section:
 
 
 def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int = 0) -> Section:
-    """Return the section with bounds and their errors, the KL of every latent over time, and Pareto k-hat."""
+    """Return the section with bounds and their errors, the KL of every latent over time, and Pareto k-hat.
+
+    The table omits the ELBO and the KL if all runs have scores, which contain both, of all test windows.
+    """
     likely = {name: run.model for name, run in runs.items() if run.model.likelihood}
     settings: dict[str, Any] = {"particles": particles, "contrasts": 0, "samples": 0, "seed": seed}
     explanation = f"Of {len(windows.keys)} test windows, evenly spread, with {particles} particles each."
@@ -311,9 +322,9 @@ def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int 
             )
         return _evidence(comparison, name)
 
-    return Section(
-        title, {name: cell(name) for name in runs}, explanation, tabulated(comparison.table()) if comparison else ""
-    )
+    omitted = ["seeds", *(["ELBO", "KL"] if all(_has_elbo(runs[name]) for name in likely) else [])]
+    table = tabulated(comparison.table(), omitted) if comparison else ""
+    return Section(title, {name: cell(name) for name in runs}, explanation, table)
 
 
 def posteriors(runs: Runs, windows: HeldOutWindows, seed: int = 0) -> Section:
@@ -461,21 +472,11 @@ def _facts(run: Loaded) -> dict[str, str]:
     }
 
 
-def _scores(run: Loaded) -> dict[str, str]:
-    """Return the scores of a run from its own evaluation, as texts."""
-    try:
+def _has_elbo(run: Loaded) -> bool:
+    with suppress(Exception):  # the section of scores reports the error
         evaluation = _evaluation(run)
-        name = None if evaluation is None else _row(run, evaluation)
-        if evaluation is None or name is None:
-            return {}
-        values = {}
-        for metric_name, score in evaluation[name].items():
-            metric = evaluation.metrics[metric_name]
-            unit = f" ({metric.unit})" if metric.unit else ""
-            values[metric_name + ARROWS[metric.better] + unit] = str(score)
-    except Exception:  # the section of scores reports the error
-        return {}
-    return {"forecasts scored, K": str(evaluation.rows[name].samples), **values}
+        return evaluation is not None and "ELBO" in evaluation.metrics
+    return False
 
 
 def _graph_picture(axes: Any, title: str) -> Markup:
