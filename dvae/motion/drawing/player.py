@@ -145,8 +145,9 @@ class Animation:
         ax = figure.add_axes((0, 0, 1, 1), xlim=(low[0] - 0.1, low[0] - 0.1 + corner), ylim=(top - rows * step[1], top))
         ax.set_axis_off()
         edges = np.array(scene.skeleton.edges)
-        people = [ax.add_collection(LineCollection([], capstyle="round")) for _ in places]
-        for name, place in zip(scene.names, places, strict=True):
+        people = [LineCollection([], capstyle="round") for _ in places]
+        for lines, name, place in zip(people, scene.names, places, strict=True):
+            ax.add_collection(lines)
             ax.text(place[0], place[1] + high[1] + 0.08, name, ha="center", fontsize=8, parse_math=False)
         clock = ax.text(0.01, 0.98, "", transform=ax.transAxes, va="top", fontsize=8)
         canvas, pictures = FigureCanvasAgg(figure), []
@@ -154,14 +155,16 @@ class Animation:
             for n, (lines, pose, place) in enumerate(zip(people, poses, places, strict=True)):
                 is_past, fixed = frame <= scene.now, [end in scene.shared(n) for end in edges[:, 1]]
                 lines.set_segments(list((pose + place)[edges]))
-                lines.set_colors([PAST if is_past else FIXED if each else scene.colours[n] for each in fixed])
-                lines.set_linewidths([3.0 if each and not is_past else 1.8 for each in fixed])
+                lines.set_color([PAST if is_past else FIXED if each else scene.colours[n] for each in fixed])
+                lines.set_linewidth([3.0 if each and not is_past else 1.8 for each in fixed])
             clock.set_text(f"{scene.seconds(frame):+.1f} s")
             canvas.draw()
             pixels = np.asarray(canvas.buffer_rgba())[..., :3]
-            pictures.append(Image.fromarray((pixels / 17.0).round().astype(np.uint8) * 17))  # white remains white
+            pictures.append((pixels / 17.0).round().astype(np.uint8) * 17)  # few colours, and white remains white
         palette = Image.fromarray(np.concatenate(pictures[::5])).quantize(COLOURS)
-        first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+        first, *others = (
+            Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures
+        )
         file = io.BytesIO()
         duration = max(20, round(every * scene.milliseconds, -1))  # in steps of 10 ms; browsers slow down faster ones
         first.save(file, "gif", save_all=True, append_images=others, duration=duration, loop=0)
