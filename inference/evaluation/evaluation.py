@@ -160,19 +160,32 @@ class Evaluation(Result):
             means.append(row.clip_means[metric])
         return means
 
-    def table(self) -> Table:
-        """Return a table of mean ± standard error, a row per metric and a column per method, by kind of score."""
+    @override
+    def table(self, metrics: Sequence[str] | None = None) -> Table:
+        """Return a table of mean ± standard error, a row per metric and a column per method, by kind of score.
+
+        Args:
+            metrics: names of the metrics to include, in any order; default: all.
+
+        Raises:
+            KeyError: when no method has a metric.
+        """
+        for name in metrics or ():
+            if name not in self.metrics:
+                raise KeyError(f"no method has a score {name!r}{nearest(name, self.metrics)}")
         table = Table(title=self._title(), caption=self._caption())
         table.add_column("", no_wrap=True)  # on a narrow terminal numbers wrap, and names do not
         for method, row in self.rows.items():
             table.add_column(f"{method}\nK = {row.samples}", justify="right")
         scores = {method: self[method] for method in self.rows}
         for program in ("free-running", "teacher-forced"):
-            metrics = {name: metric for name, metric in self.metrics.items() if metric.program == program}
-            if metrics:
+            of_program = {name: metric for name, metric in self.metrics.items() if metric.program == program}
+            if metrics is not None:
+                of_program = {name: metric for name, metric in of_program.items() if name in metrics}
+            if of_program:
                 table.add_section()
                 table.add_row(Text(program, "bold"))
-            for name, metric in metrics.items():
+            for name, metric in of_program.items():
                 unit = f" ({metric.unit})" if metric.unit else ""
                 values = (str(row[name]) if name in row else "–" for row in scores.values())
                 table.add_row(Text.assemble(name + ARROWS[metric.better], (unit, "dim")), *values)

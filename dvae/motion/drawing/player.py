@@ -15,19 +15,21 @@ import json
 import zlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from math import pi
+from math import ceil, pi
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from PIL import Image
 
 from ... import files
 from ..geometry.skeleton import Skeleton
-from .plot import FIXED, PAST, Scene, make_scene
+from .plot import FIXED, PAST, SPACING, Scene, make_scene
 
 SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
 """Script of a page with players: controls, and stages that they move together."""
@@ -39,6 +41,12 @@ MILLIMETRE = 1e-3
 
 MISSING = -32768
 """Integer that stands for an unknown coordinate."""
+
+FRAMES, COLOURS = 40, 32
+"""Largest numbers of pictures and colours of a GIF."""
+
+WIDTH, PIXELS, ACROSS = 600.0, 95.0, 6
+"""Largest width of a GIF in pixels, its pixels per metre, and its number of people in a row."""
 
 _CONTROLS = Markup(
     '<div class="controls"><button type="button">Play</button>'
@@ -119,7 +127,7 @@ def _pack(steps: np.ndarray) -> str:
 class Animation:
     """Skeletons that move next to each other.
 
-    Notebooks display the animation; `save` writes a page that any browser plays offline.
+    Notebooks display a GIF. `save` writes an interactive page that any browser plays offline.
 
     Args:
         scene: scene with the people.
@@ -143,35 +151,59 @@ class Animation:
         with files.atomic_write(path) as file:
             file.write(self.to_html().encode())
 
-    def still(self) -> Figure:
-        """Draw the last frame, seen from the front."""
+    def to_gif(self) -> bytes:
+        """Return a GIF that repeats the motion at original speed, in at most `FRAMES` pictures.
+
+        All people stay in their places: every pose is drawn relative to its pelvis, seen from the front.
+        """
         scene = self.scene
-        motion = scene.motion[:, scene.frames[-1]] + scene.places[:, None]
-        low, high = (find(motion[..., [0, 2]], axis=(0, 1)) for find in (np.nanmin, np.nanmax))
-        figure = Figure(
-            figsize=(9, float(np.clip(9 * (high - low)[1] / (high - low)[0], 1.5, 6))), dpi=72, layout="constrained"
-        )
-        ax = figure.subplots()
-        edges = np.array(scene.skeleton.edges)
-        for name, colour, person in zip(scene.names, scene.colours, motion, strict=True):
-            ax.add_collection(LineCollection(list(person[edges][..., [0, 2]]), colors=colour, linewidths=1.8))
-            if np.isfinite(person).any():  # a truth may end early
-                place = np.nanmean(person[:, 0]), np.nanmax(person[:, 2]) + 0.1
-                ax.text(*place, name, ha="center", parse_math=False)
-        ax.autoscale_view()
-        ax.set_aspect("equal")
+        every = ceil(len(scene.frames) / FRAMES)
+        motion = scene.motion[:, scene.frames][:, ::every][..., [0, 2]]
+        motion = motion - motion[..., scene.skeleton.root, None, :] * [1, 0]
+        low, high = (find(motion, axis=(0, 1, 2)) for find in (np.nanmin, np.nanmax))
+        step = [max(SPACING, high[0] - low[0] + 0.2), high[1] - low[1] + 0.4]
+        rows = ceil(len(motion) / ACROSS)
+        row, column = np.divmod(np.arange(len(motion)), ceil(len(motion) / rows))
+        places = np.stack([column * step[0], -row * step[1]], -1)
+        corner, top = (1.0 * column.max() + 1) * step[0], high[1] + 0.35
+        width = min(WIDTH, PIXELS * corner)
+        figure = Figure(figsize=(width / 72, width * rows * step[1] / corner / 72), dpi=72)
+        ax = figure.add_axes((0, 0, 1, 1), xlim=(low[0] - 0.1, low[0] - 0.1 + corner), ylim=(top - rows * step[1], top))
         ax.set_axis_off()
-        return figure
+        edges = np.array(scene.skeleton.edges)
+        people = [LineCollection([], capstyle="round") for _ in places]
+        for lines, name, place in zip(people, scene.names, places, strict=True):
+            ax.add_collection(lines)
+            ax.text(place[0], place[1] + high[1] + 0.08, name, ha="center", fontsize=8, parse_math=False)
+        clock = ax.text(0.01, 0.98, "", transform=ax.transAxes, va="top", fontsize=8)
+        canvas, pictures = FigureCanvasAgg(figure), []
+        for frame, poses in zip(scene.frames[::every], motion.swapaxes(0, 1), strict=True):
+            for n, (lines, pose, place) in enumerate(zip(people, poses, places, strict=True)):
+                is_past, fixed = frame <= scene.now, [end in scene.shared(n) for end in edges[:, 1]]
+                lines.set_segments(list((pose + place)[edges]))
+                lines.set_color([PAST if is_past else FIXED if each else scene.colours[n] for each in fixed])
+                lines.set_linewidth([3.0 if each and not is_past else 1.8 for each in fixed])
+            clock.set_text(f"{scene.seconds(frame):+.1f} s")
+            canvas.draw()
+            pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+            pictures.append((pixels / 17.0).round().astype(np.uint8) * 17)  # few colours, and white remains white
+        palette = Image.fromarray(np.concatenate(pictures[::5])).quantize(COLOURS)
+        first, *others = (
+            Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures
+        )
+        file = io.BytesIO()
+        duration = max(20, round(every * scene.milliseconds, -1))  # in steps of 10 ms; browsers slow down faster ones
+        first.save(file, "gif", save_all=True, append_images=others, duration=duration, loop=0)
+        return file.getvalue()
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
-        """Return the player for notebooks, and the last frame as a fallback."""
-        png = io.BytesIO()
-        self.still().savefig(png, format="png")
-        page = Markup('<iframe srcdoc="{}" style="width:100%;height:30em;border:0"></iframe>').format(self.to_html())
+        """Return a GIF for notebooks, as HTML, which also moves where no kernel or script runs."""
+        gif = base64.b64encode(self.to_gif()).decode()
         return {
-            "text/html": str(page),
-            "image/png": base64.encodebytes(png.getvalue()).decode(),
-            "text/plain": "a still; run the cell to play it",
+            "text/html": str(
+                Markup('<img alt="{}" src="data:image/gif;base64,{}">').format(self.title or "motion", gif)
+            ),
+            "text/plain": f"animation of {', '.join(self.scene.names)}",
         }
 
 

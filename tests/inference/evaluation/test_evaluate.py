@@ -217,6 +217,14 @@ def test_table_and_plot_show_every_method_and_metric(model):
     assert len([axes for axes in result.plot(["ADE", "FDE"]).axes if axes.axison]) == 2
 
 
+def test_a_table_of_some_metrics_has_no_other_rows(model):
+    result = run({"dkf": model}, array_windows())
+    assert result.table(["FDE", "ADE", "KL z"]).row_count == 5  # and a row for each program
+    assert result.table(["ADE"]).row_count == 2
+    with pytest.raises(KeyError, match=r"no method has a score 'ADF'.*did you mean"):
+        result.table(["ADF"])
+
+
 @pytest.mark.parametrize(
     ("score", "text"),
     [

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import io
 import json
 import re
 import zlib
@@ -10,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from dvae import motion
 from dvae.cli import main
@@ -97,12 +99,38 @@ def test_mismatched_arrays_are_errors(bodies):
 @pytest.mark.parametrize("title", ["Gehen: größer", "</script><b>"])
 def test_the_page_needs_no_network_and_escapes_its_title(bodies, tmp_path, title):
     player = animate(WALKER, *bodies, title=title)
-    assert "srcdoc" in player._repr_mimebundle_()["text/html"]
     player.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert html.escape(title) in page
     assert "<b>" not in page
     assert "http" not in re.sub("(?s)<script>.*", "", page).replace("http-equiv", "")
+
+
+@pytest.mark.parametrize("frames", [1, 50])
+def test_a_notebook_shows_a_gif_at_original_speed(bodies, frames):
+    observed, samples, truth = bodies
+    film = animate(WALKER, observed, samples.repeat(frames, 1), truth, fixed=[1, 2], title='"<b>')
+    html_of_film = film._repr_mimebundle_()["text/html"]
+    assert "<b>" not in html_of_film
+    gif = base64.b64decode(re.search('src="data:image/gif;base64,([^"]*)"', html_of_film)[1])
+    assert gif == film.to_gif()
+    with Image.open(io.BytesIO(gif)) as picture:
+        assert 10 < picture.n_frames <= 40
+        seconds = 0
+        for frame in range(picture.n_frames):
+            picture.seek(frame)
+            seconds += picture.info["duration"] / 1000
+        assert picture.info["loop"] == 0  # without end
+        assert seconds == pytest.approx((NOW + HORIZON * frames) / WALKER.fps, rel=0.15)
+
+
+def test_the_colours_of_a_gif_follow_the_observed_frames(bodies):
+    with Image.open(io.BytesIO(animate(WALKER, *bodies, every=1).to_gif())) as picture:
+        for frame in range(picture.n_frames):
+            picture.seek(frame)
+            pixels = np.asarray(picture.convert("RGB")).astype(int).reshape(-1, 3)
+            assert (pixels.max(1) - pixels.min(1) > 60).any() == (frame >= NOW)
+            assert (pixels == 255).all(1).mean() > 0.8  # the background
 
 
 @pytest.fixture
