@@ -99,7 +99,12 @@ class Reconstruction(Result):
         """Draw Tukey's box plots of vertex errors: quartiles, whiskers to 1.5 interquartile ranges, and outliers."""
         figure = new_figure(7, 0.8 + 0.3 * len(self.rows))
         axes = figure.subplots()
-        axes.boxplot([row[ERROR] for row in self.rows.values()], vert=False, widths=0.6, flierprops={"markersize": 2})
+        axes.boxplot(
+            [row[ERROR] for row in self.rows.values()],
+            orientation="horizontal",
+            widths=0.6,
+            flierprops={"markersize": 2},
+        )
         axes.set_yticks(range(1, len(self.rows) + 1), list(self.rows), parse_math=False)
         axes.invert_yaxis()
         axes.set_xlim(left=0)

@@ -127,7 +127,7 @@ def test_motion_that_cannot_be_cut_is_an_error():
         ),
         (
             lambda: gait_cycles(people, references, Cycles(rate=25.0)),
-            "a reference has 30 frames a second, expected 25",
+            "a reference has 30 frames a second, but `cycles` compares at 25",
         ),
         (lambda: Cycles(shortest=2.0, longest=1.0), "`shortest` must be at most `longest`"),
     ):
