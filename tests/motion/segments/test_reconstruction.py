@@ -86,7 +86,7 @@ def test_a_reconstruction_is_printed_drawn_and_stored(segments, model, tmp_path)
     assert str(again) == str(result)
     assert f"{len(test)} segments of {len(test)} takes" in str(result)
     axes = result.plot().axes[0]
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["m", "PCA of 11"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["m", "PCA of 11"]
     with pytest.raises(KeyError, match="no row 'n'"):
         result["n"]
     with pytest.raises(ValueError, match="at least one model"):
