@@ -55,12 +55,11 @@ def test_equations_of_a_grid_read_covariates_of_the_data(study):
     assert Grid.read(study).methods["covariates"].build({"x": 2, "c": 3, "s": 1}).context == ("c", "s")
 
 
-def test_the_study_of_the_docs_is_a_grid(tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "study.md").read_text(encoding="utf-8")
+def test_the_grid_of_the_docs_is_read(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "sweeps_and_studies.md").read_text(encoding="utf-8")
     (tmp_path / "study.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     grid = Grid.read(tmp_path / "study.toml")
-    assert list(grid.methods) == ["filter", "chain", "person", "switching"]
-    assert grid.methods["switching"].sizes()["k"] == 3
+    assert list(grid.methods) == ["filter", "chain-latent=8", "chain-latent=16", "srnn"]
     assert grid.seeds == (0, 1, 2)
     for method in grid.methods.values():
         method.build({"x": 3})
