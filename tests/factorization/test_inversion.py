@@ -140,7 +140,7 @@ def test_a_model_accepts_faithful_as_its_guide():
             lambda: faithful_inverse(
                 Factorization.parse("p(z_t | z_{own}) p(x_t | z_t)", {"own": Relation.parse("<t").mask})
             ),
-            "a custom mask",
+            "has the custom mask",
         ),
         (lambda: dvae.alternatives("p(x_t | x_{<t})"), "has no latents"),
         (
