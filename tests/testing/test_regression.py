@@ -415,7 +415,9 @@ def test_the_price_of_a_mean_field_guide(elbo_regression):
 
 @pytest.mark.slow
 def test_the_documented_examples_run(pytester):
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "how-to" / "test_your_model.md").read_text(encoding="utf-8"), re.DOTALL)
+    blocks = re.findall(
+        r"```python\n(.*?)```", (DOCS / "how-to" / "test_your_model.md").read_text(encoding="utf-8"), re.DOTALL
+    )
     pytester.makepyfile(test_documented="\n".join(blocks))
     pytester.makeconftest("from dvae.testing import FactorizationContract as contract\ncontract.training_steps = 2")
     # in a separate process: training loads modules of torch that a process can load only once
