@@ -243,7 +243,7 @@ class FamilyModule(ConditionalDistribution):
         self.centred = "loc" in self.forms and self.moves.get("loc") is _location
         if self.residual and "loc" not in self.forms:
             raise ValueError(
-                f"{self.kind.__name__} has no location to which a previous value could be added; use residual=0"
+                f"{self.kind.__name__} has no location, so no previous value can be added to it; use residual=0"
             )
         widths = {name: math.prod(free) for name, (free, _, _) in self.forms.items()}
         names = [name for name in widths if name not in spec.learned]

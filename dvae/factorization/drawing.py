@@ -115,7 +115,7 @@ def draw_slice(
 
 
 def _draw_node(ax: Axes, xy: tuple[float, float], symbol: str, kind: str) -> Patch:
-    """Draw a node with its label and return its outline, at which edges end."""
+    """Draw a node with its label and return its outline; edges end there."""
     from matplotlib.patches import Circle, Rectangle
 
     (x, y), side = xy, 2 * RADIUS
@@ -190,7 +190,7 @@ def _slice_layout(graph: nx.DiGraph) -> dict[Any, tuple[float, float]]:
 
 
 def _bend(source: Any, target: Any, positions: Mapping[Any, tuple[float, float]]) -> float:
-    """Return the smallest curvature with which an edge does not touch other nodes, as the `rad` of matplotlib's arc3.
+    """Return the smallest curvature of an edge that does not touch other nodes, as the `rad` of matplotlib's arc3.
 
     Edges within the lowest row preferably bend downwards, edges within other rows upwards.
     """

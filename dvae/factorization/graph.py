@@ -327,7 +327,7 @@ class Derived:
 
 @dataclass(frozen=True)
 class Alternatives(_TextTable):
-    """All guides of a model that `faithful_inverse` derives, none of which has missing parents.
+    """All guides of a model that `faithful_inverse` derives; each reads all that its exact posterior depends on.
 
     Guides without a loop over time come first, sorted by their number of edges, then guides with a loop, sorted in the
     same way. Index an object with i for the factorization of guide i; `len` returns the number of guides.

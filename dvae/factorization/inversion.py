@@ -93,7 +93,7 @@ def _bit_indices(bits: int) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Unrolled:
-    """The inner steps of an unrolled graph, for which dependencies are converted into relations.
+    """The inner steps of an unrolled graph, whose dependencies become relations.
 
     The first and last steps of the graph are margins. Results exclude them, because their past or future is cut off.
 
@@ -150,7 +150,7 @@ class Unrolled:
     def parent(self, child: str, name: str, offsets: np.ndarray) -> Parent:
         """Return a parent that is read at these offsets.
 
-        The most distant offset of the inner steps stands for all offsets beyond it, so its relation has no bound.
+        The most distant offset of the inner steps represents all offsets beyond it, so its relation has no bound.
 
         Args:
             child: name of the child.

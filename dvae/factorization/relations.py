@@ -138,7 +138,7 @@ class Relation:
     def directions(self) -> frozenset[int]:
         """Directions in time that the relation reads: -1 for the past, 0 for the same step, +1 for the future.
 
-        The directions of a custom mask are those of its entries at several lengths.
+        For a custom mask, the directions of its entries at several lengths.
         """
         if self.intervals is not None:
             reads = {-1: (-math.inf, -1), 0: (0, 0), 1: (1, math.inf)}

@@ -386,7 +386,7 @@ class TrajectoryModel(DynamicalVAE):
             lengths["frames"] = frames
         if len(set(lengths.values())) != 1 or min(lengths.values()) < 1:
             lengths_text = ", ".join(f"{name}: {length}" for name, length in lengths.items()) or "neither"
-            raise ValueError(f"expected paths of equal length, or `frames` if there are no paths; got {lengths_text}")
+            raise ValueError(f"expected paths of equal length, or `frames` without paths; got {lengths_text}")
         if exact and not paths:
             raise ValueError("exact=True makes motions follow paths, but got no path; give trajectories")
         if exact and not self.latents:
