@@ -160,7 +160,10 @@ def first(model: Any, opened: MotionData, apart: motion.Protocol) -> dict[str, T
     bands = dvae.conformal_bands(model, halves[0], LEVEL, samples=SAMPLES, progress=False)
     judged = bands.coverage(model, halves[1], progress=False)["model"]
     lines = [
-        [region, *(str(judged[f"{what} 90 %, {region}"]) for what in ("said", "width said", "held", "width held"))]
+        [
+            region,
+            *(str(judged[f"{what} 90 %, {region}"]) for what in ("raw", "width raw", "calibrated", "width calibrated")),
+        ]
         for region in REGIONS
     ]
     covered = Table(["held at once", "said", "width said (m)", "conformal", "width conformal (m)"], lines)

@@ -381,7 +381,7 @@ class _Log:
                     if row is None:  # a damaged row, which `JSONLines.read` reports
                         continue
                     self.step = row["step"]
-                    self.bound = row.get("validation/self_fed/bound", row.get("validation/bound", self.bound))
+                    self.bound = row.get("validation/scheduled_sampling/bound", row.get("validation/bound", self.bound))
         return has_started
 
     def _stamp(self) -> tuple[int, int] | None:

@@ -223,11 +223,11 @@ class Bracket(Result):
         if self.extents != {"sequence": {len(self.keys)}} or not self.keys:
             raise ValueError(f"every bound must have one value for each of the {len(self.keys)} sequences in `keys`")
         if not all(np.isfinite(values).all() for values in (self.frames, *real.values(), *simulated.values())):
-            raise ValueError("bounds and numbers of frames must be finite")
+            raise ValueError("bounds and numbers of steps must be finite")
         if self.equations.keys() != {"generative", "inference"}:
             raise ValueError("equations must have the keys generative and inference")
         if not all(isinstance(word, str) for word in axis_names(self.data)):
-            raise ValueError("the names of sequences and frames must be text")
+            raise ValueError("the words for a sequence and a step must be text")
 
 
 def format_estimate(estimate: Estimate) -> str:

@@ -67,7 +67,7 @@ class PredictionBands(Result):
         >>> kept, new = (dvae.ArrayWindows(torch.randn(40, 8, 2), observed=4) for _ in range(2))
         >>> bands = dvae.conformal_bands(model, kept, level=0.9, samples=20, progress=False)
         >>> lower, upper = bands.apply(model.forecast(new.all()["x"][:, :4], 4, 20, draw_emission=True)["x"])
-        >>> lower.shape, bands.coverage(model, new)["model"]["held 90 %, future"].mean > 0.7
+        >>> lower.shape, bands.coverage(model, new)["model"]["calibrated 90 %, future"].mean > 0.7
         (torch.Size([40, 4, 2]), True)
     """
 
@@ -114,22 +114,22 @@ class PredictionBands(Result):
         """
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
-        percent, least = f"{100 * self.level:g} %", {"said": max(3, _min_count(self.level)), "held": 1}
+        percent, least = f"{100 * self.level:g} %", {"raw": max(3, _min_count(self.level)), "calibrated": 1}
 
         @lru_cache(maxsize=1)  # shared by all scores of a batch
         def coverage_and_width(forecasts: Tensor, truth: Tensor) -> dict[tuple[str, str], tuple[Tensor, Tensor]]:
             gaps = truth.isnan()
             spread = self._spread(forecasts)
             distances, own_distances = standardised(forecasts, truth, spread), None
-            if forecasts.shape[1] >= least["said"]:
+            if forecasts.shape[1] >= least["raw"]:
                 own_distances = _own_distances(forecasts, None if self.spread is None else spread).masked_fill(
                     gaps[:, None], torch.nan
                 )
             result = {}
             for region in REGIONS:
-                far, factors = largest_by_region(distances, region), {"held": self._factor(region, forecasts)}
+                far, factors = largest_by_region(distances, region), {"calibrated": self._factor(region, forecasts)}
                 if own_distances is not None:
-                    factors["said"] = _smallest(largest_by_region(own_distances, region), self.level)
+                    factors["raw"] = _smallest(largest_by_region(own_distances, region), self.level)
                 for kind, factor in factors.items():
                     inside = (far <= factor).double().masked_fill(far.isnan(), torch.nan)
                     width = (2 * factor * spread / scales).masked_fill(gaps, torch.nan)
@@ -146,7 +146,7 @@ class PredictionBands(Result):
                 pool=clips_alike,
                 least=least[kind],
                 of_draws=True,
-                note="said: quantiles of the forecasts alone; held: recalibrated bands. Clips have equal weight",
+                note="raw: quantiles of the forecasts; calibrated: conformal bands. Sequences have equal weight",
             )
 
         return [measure(kind, region, place) for place in (0, 1) for region in REGIONS for kind in least]
@@ -170,7 +170,7 @@ class PredictionBands(Result):
             progress: whether to show a progress bar.
 
         Returns:
-            `scores` of these forecasts. Names with "said" are before recalibration, names with "held" after it.
+            `scores` of these forecasts. Names with "raw" are before recalibration, names with "calibrated" after it.
         """
         models, references = ({}, [model]) if isinstance(model, str) else (model, [])
         return evaluate(

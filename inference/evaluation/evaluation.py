@@ -305,7 +305,7 @@ class Evaluation(Result):
         by_method = {method: by_frame("PIT", row.histograms) for method, row in self.rows.items()}
         by_method = {method: histograms for method, histograms in by_method.items() if histograms}
         if not by_method:
-            raise KeyError("this evaluation has no PIT histograms of single frames; evaluate with scores=over_horizon")
+            raise KeyError("this evaluation has no PIT histograms of single steps; evaluate with scores=over_horizon")
         columns = max(map(len, by_method.values())) + 1
         figure = new_figure(1 + 1.5 * columns, 0.9 + 1.7 * len(by_method))
         panels = figure.subplots(len(by_method), columns, squeeze=False)

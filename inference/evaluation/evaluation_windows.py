@@ -24,7 +24,7 @@ class EvaluationWindows:
         windows: source of the windows.
         batch: batch of all windows.
         observed: O, number of observed frames.
-        keys: (split, clip, first frame) of each window.
+        keys: (split, sequence, first step) of each window.
     """
 
     windows: HeldOutWindows
@@ -155,14 +155,14 @@ def refuse_non_finite(name: str, quantity: str, finite: Tensor, keys: Sequence[t
         name: name of the method.
         quantity: name of the result, such as "bound".
         finite: (B,), whether the result of each window is finite.
-        keys: (split, clip, first frame) of each window.
+        keys: (split, sequence, first step) of each window.
 
     Raises:
         FloatingPointError: when an entry of `finite` is False.
     """
     if not finite.all():
-        split, clip, start = keys[int(finite.logical_not().nonzero()[0])]
+        split, sequence, start = keys[int(finite.logical_not().nonzero()[0])]
         raise FloatingPointError(
-            f"the {quantity} of {name} is not finite for the window at frame {start} of clip {clip!r} ({split}); "
+            f"the {quantity} of {name} is not finite for the window at step {start} of {sequence!r} ({split}); "
             "it cannot be omitted, because all methods are scored on the same windows"
         )

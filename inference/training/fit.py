@@ -105,8 +105,8 @@ class Fit:
             return ""
         if any("validation/loss" in row for row in self.history):
             return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
-        self_fed = any("validation/self_fed/bound" in row for row in self.history)
-        name = "best bound with scheduled sampling" if self_fed else "best bound"
+        scheduled = any("validation/scheduled_sampling/bound" in row for row in self.history)
+        name = "best bound with scheduled sampling" if scheduled else "best bound"
         best = f"{name} {self.best_bound:.3f} nats a {self.per} at training step {self.best_step}"
         if self.last_value is None or self.best_bound >= self.last_value:
             return best
@@ -115,7 +115,7 @@ class Fit:
             heads = [model.generator[name].head for name in model.observed]
             if not any(head.residual or isinstance(head, FamilyModule | ProductModule) for head in heads):
                 advice.append("try residual=1, which adds the output to the last value")
-            if not self_fed:
+            if not scheduled:
                 advice.append("try scheduled_sampling=1, which trains on the model's own output")
         return f"{best}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
 
@@ -484,9 +484,9 @@ def _train(
         if due and held_out is not None:
             report(svi.validate(held_out))
             if observed is not None and state.last_value is None and "validation/loss" not in state.row:
-                self_fed = bool(svi.final_feeding) and isinstance(model.feeding, ScheduledSampling)
+                scheduled = bool(svi.final_feeding) and isinstance(model.feeding, ScheduledSampling)
                 state.last_value = last_value_bound(
-                    model, source, held_out, observed, fed=self_fed, batch_size=training.batch_size
+                    model, source, held_out, observed, fed=scheduled, batch_size=training.batch_size
                 )
             call("on_validation")
             stopped = is_stop_requested()

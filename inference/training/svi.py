@@ -235,7 +235,7 @@ class SVI:
         The draws from the guide are the same at each call, so bounds differ only by the weights. Processes share the
         data, and each returns the terms of all data. The row of a model without a likelihood has a "loss" instead of a
         bound. An objective that selects by "loss" adds it to the row. A run with scheduled sampling adds
-        "self_fed/bound", the bound with the scheduled-sampling probability at the end of the run.
+        "scheduled_sampling/bound", the bound with the scheduled-sampling probability at the end of the run.
 
         Args:
             data: x as a tensor (N, T, D), a batch, an object whose `all()` returns a batch, or one whose
@@ -245,20 +245,20 @@ class SVI:
         row = self._score(held_out, 0.0)
         if self.final_feeding:
             score = "loss" if "loss" in row else "bound"
-            row[f"self_fed/{score}"] = self._score(held_out, self.final_feeding)[score]
+            row[f"scheduled_sampling/{score}"] = self._score(held_out, self.final_feeding)[score]
         return row
 
     def validate(self, data: Any) -> dict[str, float]:
         """Return the row of `evaluate` with the prefix "validation/"; store the weights if they are the best so far.
 
         Scheduled sampling trains a model to run on its own output, which lowers the bound on the true past. Its best
-        weights are therefore selected by "self_fed/bound", once the schedule has reached its last value.
+        weights are therefore selected by "scheduled_sampling/bound", once the schedule has reached its last value.
 
         Without a likelihood, or if the objective selects by "loss", the best weights have the lowest loss. At a stage
         with another objective, this comparison starts again.
         """
         state, row = self.state, self.evaluate(data)
-        prefix = "self_fed/" if self.final_feeding else ""
+        prefix = "scheduled_sampling/" if self.final_feeding else ""
         score = -row[f"{prefix}loss"] if "loss" in row else row[f"{prefix}bound"]
         if not prefix or self.rates(state.step - 1)["scheduled_sampling"] == self.final_feeding:
             state.waited += 1
@@ -440,8 +440,8 @@ def _describe_non_finite(model: nn.Module, terms: Terms, loss: Tensor) -> str:
                 first = f"the {group} of {name} is {value[invalid][0].item()}"
                 location = f"in {int(invalid.sum())} of {len(value)} sequences"
                 if name in terms.steps:
-                    frames = (~torch.isfinite(terms.steps[name])).any(0).nonzero().flatten().tolist()
-                    location += f", frames {', '.join(map(str, frames[:3]))}{'…' if len(frames) > 3 else ''}"
+                    steps = (~torch.isfinite(terms.steps[name])).any(0).nonzero().flatten().tolist()
+                    location += f", time steps {', '.join(map(str, steps[:3]))}{'…' if len(steps) > 3 else ''}"
                 return f"{first} {location}"
     if not torch.isfinite(loss):
         return f"the loss is {loss.item()} although every term is finite, so a weight of the objective is not finite"

@@ -242,7 +242,9 @@ class Terminal:
         terms = ("log_likelihood/", "kl/", "energy/") if likelihood else ("energy/",)
         names = [name for name in self._latest if name.startswith(terms)]
         score = "bound" if likelihood else "loss"
-        names += [n for n in (score, f"validation/{score}", f"validation/self_fed/{score}") if n in self._latest]
-        labels = [name.replace(f"self_fed/{score}", f"{score} with scheduled sampling") for name in names]
+        names += [
+            n for n in (score, f"validation/{score}", f"validation/scheduled_sampling/{score}") if n in self._latest
+        ]
+        labels = [name.replace(f"scheduled_sampling/{score}", f"{score} with scheduled sampling") for name in names]
         labels = [n.replace("log_likelihood", "log p").removeprefix("energy/").replace("/", " ") for n in labels]
         return "  ".join(f"{label} {self._latest[name]:.3f}" for label, name in zip(labels, names, strict=True))

@@ -623,7 +623,7 @@ def test_prediction_bands_are_calibrated_on_validation_windows_or_labelled_clips
         str(tmp_path / "a.png"),
     ]
     assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5", *options]) == 0
-    assert "held 50 %, future" in capsys.readouterr().out
+    assert "calibrated 50 %, future" in capsys.readouterr().out
     test = data.windows("test").clips
     assert dvae.PredictionBands.load(tmp_path / "a.json").clips == sum(clip.labels["style"] == "a" for clip in test)
     assert (tmp_path / "a.png").stat().st_size

@@ -212,7 +212,7 @@ def test_records_of_a_run_are_reported(scored, tmp_path):
     assert "amortisation" in bracket
     assert json.loads((scored / "posterior.json").read_text())["stein"]["summary"]["verdict"] in posterior
     assert "compared with the posterior of 1 sequences" in posterior
-    assert "held 40 %" in bands
+    assert "calibrated 40 %" in bands
     pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
     dvae.ablate(pair, steps=2, surrogates=1).save(tmp_path / "a.json")
     edges = document("a", [sections.edges(dvae.Ablation.load(tmp_path / "a.json"))])

@@ -200,7 +200,7 @@ def test_the_table_is_read_from_the_logs(tmp_path):
     assert log.look()
     assert (log.step, log.bound) == (50, 2.5)
     with file.open("a") as more:
-        more.write('0, "validation/bound": 2.0, "validation/self_fed/bound": 1.5}\n')
+        more.write('0, "validation/bound": 2.0, "validation/scheduled_sampling/bound": 1.5}\n')
     assert not log.look()
     assert (log.step, log.bound) == (60, 1.5)  # as for the choice of the best weights
     damaged = ["{", "[]", "7", '{"bound": 1}', '{"step": "7"}', "[" * 100_000, '{"step": 7, "validation/bound": 1%s}']

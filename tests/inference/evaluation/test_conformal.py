@@ -101,11 +101,11 @@ def test_bands_of_exact_forecasts_have_their_coverage_and_narrow_ones_less(fitte
         bands = conformal_bands(each, calibration, samples=30, progress=False)
         coverage = bands.coverage(each, new, progress=False)["model"]
         for region in ("number", "step", "future"):
-            held_share, expected_share = (coverage[f"{word} 90 %, {region}"] for word in ("held", "said"))
+            held_share, expected_share = (coverage[f"{word} 90 %, {region}"] for word in ("calibrated", "raw"))
             # calibration and evaluation have equally many clips, and so equally large errors
             assert abs(held_share.mean - 0.9) < 4 * math.sqrt(2) * held_share.standard_error, region
             assert (abs(expected_share.mean - 0.9) < 5 * expected_share.standard_error) == right, region
-        widths = [coverage[f"width held 90 %, {region}"].mean for region in ("number", "step", "future")]
+        widths = [coverage[f"width calibrated 90 %, {region}"].mean for region in ("number", "step", "future")]
         assert widths == sorted(widths)
 
 
