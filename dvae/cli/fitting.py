@@ -356,7 +356,8 @@ def _use(name: str, run: Path) -> str:
         return f"score {target} with: dvae evaluate RUN {option} {run}"
     advice = f"score it with: dvae evaluate {run}"
     if Run(run).config["data"].get("kind") == "panel":
-        return f"{advice}\nforecast with: dvae forecast {run} --out FILE.csv --figure FILE.png"
+        command = f"dvae forecast {run} --out FILE.csv --figure FILE.png"
+        return f"{advice}\nforecast its test windows with: {command}\nand the future with: {command} --beyond"
     if methods()[name].fitted_on == "segments":
         return f"{advice}\nrecover a segment from a part of it with: dvae impute {run} --from CLIP --seen markers"
     if issubclass(methods()[name], TrajectoryMethod):

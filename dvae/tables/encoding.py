@@ -107,8 +107,9 @@ class PanelSchema(Schema):
         parts = [(panel.series[n], slice(low, end)) for (n, low, _), end in zip(starts, ends, strict=True)]
         if not parts:
             raise ValueError(
-                f"{panel.name} has no training window of {cut.name}: its sequences have "
-                f"{min(map(len, panel.series))} to {max(map(len, panel.series))} steps"
+                f"{panel.name} has no training window of {cut.name}: its longest sequence has "
+                f"{max(map(len, panel.series))} steps, and the split may leave fewer for training; choose fewer "
+                "observed steps or a shorter horizon (--observed, --horizon)"
             )
         training = [sequence.values[part] for sequence, part in parts]
         summary, steps = ColumnSummary.of(row_blocks(training)), sum(map(len, training))
