@@ -38,9 +38,12 @@ MAX_SEQUENCES = 2**17
 
 
 class Discrete(int):
-    """The size of a categorical latent that is summed out: its number of states; values are one-hot vectors.
+    """Size of a categorical latent that is summed out, as a number of states; its values are one-hot vectors.
 
     The latent has a factor in the generative model and none in the guide.
+
+    Args:
+        states: number of states K, at least 2.
 
     Raises:
         ValueError: if there are fewer than two states.

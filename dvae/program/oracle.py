@@ -423,6 +423,9 @@ def kl_gap(
         steps: T.
         seeds: number of random models.
 
+    Raises:
+        ValueError: `steps` or `seeds` is less than 1, a text cannot be parsed, or the guide does not fit the model.
+
     Example:
         >>> dvae.kl_gap("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, steps=3, seeds=1) > 0
         tensor([True])

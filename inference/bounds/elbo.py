@@ -366,6 +366,9 @@ def iwae_bound(
     Returns:
         Bound and tail shape, (B,) each.
 
+    Raises:
+        ValueError: `particles` is less than 1, or the model has no likelihood.
+
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
         >>> dvae.iwae_bound(model, torch.randn(3, 4, 2), particles=16).bound.shape

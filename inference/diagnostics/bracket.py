@@ -277,6 +277,10 @@ def bracket(
         batch_size: number of sequences in a batch.
         progress: whether to show a progress bar.
 
+    Returns:
+        Each bound by name, (N,) in nats per sequence, for "real" and for "simulated" data; only the simulated data have
+        the upper bound.
+
     Raises:
         ValueError: when the model has no latents or likelihood, the batch has groups that share latents, or a number is
             out of range.

@@ -180,6 +180,9 @@ def posterior(
         chunk: largest number of sequences times starts in memory.
         progress: whether to show a progress bar.
 
+    Returns:
+        Modes (B, ...) of the latents, their energies (B,) in nats, and the normal approximations at the modes.
+
     Raises:
         ValueError: when the program has no latents, a site has no separate log-density for each sequence, or the prior
             is not log-concave.

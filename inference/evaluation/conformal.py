@@ -274,6 +274,10 @@ def conformal_bands(
         options: further arguments of the model's `forecast`.
         progress: whether to show a progress bar.
 
+    Returns:
+        Factors on the spread of forecasts by region, and the spread (H, D) if `residuals` is given;
+        `PredictionBands.scores` evaluates the coverage on other windows.
+
     Raises:
         ValueError: when the level is invalid or needs more clips, forecasts have no spread, or `groups` and windows
             differ in number. Also when windows cannot be forecast, or are part of a split by time.

@@ -298,7 +298,13 @@ class Completed:
         return self.program.model
 
     def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> IWAEBound:
-        """Return the log evidence of the observations with its k-hat; arguments as in `Posterior.evidence`."""
+        """Return the log evidence of the observations in nats, (B,), by importance sampling, with its k-hat.
+
+        Args:
+            particles: K, number of draws from the normal approximation of the posterior.
+            seed: seed of the draws.
+            chunk: largest number of segments times particles in memory.
+        """
         with evaluating(self.model):
             return self.posterior.evidence(self.program, self.observations, particles, seed=seed, chunk=chunk)
 
