@@ -1,6 +1,6 @@
-r"""Parse equations in the notation of papers into factorizations.
+r"""Parse equations, written as in papers, into factorizations.
 
-A factorization states which variables each factor reads, and at which time steps:
+A factorization is a product of factors. Each factor lists the variables and the time steps that it reads:
 
     p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)
 

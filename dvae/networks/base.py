@@ -164,10 +164,13 @@ class FixedLengthNetwork(Network):
 
 
 def presence(name: str) -> str:
-    """Return the name under which a network receives the mask (B, T) of the steps at which a latent exists.
+    """Return the name of a latent's presence mask (B, T) among the inputs of a network.
 
-    The mask is missing if the latent exists at all steps. At steps with False, the latent is integrated out
-    (`Rollout.present`), and the network must not read its values.
+    The mask is True at steps where the latent exists. A latent that exists at all steps has no mask. At the other steps
+    the latent is integrated out (`Rollout.present`), and the network must not read its values.
+
+    Args:
+        name: name of the latent.
     """
     return f"{name} is there"
 

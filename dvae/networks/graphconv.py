@@ -56,8 +56,9 @@ class GraphConv:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
         Raises:
-            ValueError: the child is static, a size does not match the number of nodes, no parent contains all nodes, a
-                parent is not read from its first step on at every t, or `coefficients` is not between 1 and `length`.
+            ValueError: the child is static, a size does not match the number of nodes, or no parent contains all nodes.
+                Also if the factor does not read the first step of a parent at every t, or `coefficients` is not between
+                1 and `length`.
         """
         return GraphConvNetwork(self, inputs, local, size)
 
