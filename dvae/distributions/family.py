@@ -218,6 +218,9 @@ class Family:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: Pyro has no such distribution, or the distribution does not declare constraints. Also if a
                 parameter is unknown, a parameter that must be given is missing, or all parameters are given. Also if
@@ -435,6 +438,9 @@ class NormalMixture:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: `components` is less than 1.
         """
@@ -497,7 +503,11 @@ class LowRankNormal:
     residual: float = False
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Args:
+            shape: the variable and its features.
+        """
         family = Family(
             "LowRankMultivariateNormal", {}, (), {"cov_factor": (-1, self.rank)}, self.min_scale, self.residual
         )

@@ -232,6 +232,9 @@ class Factorization:
             masks: custom relations; `masks={"band": function}` defines `z_{band}`, where function(T) returns a bool
                 array (T, T) with rows t and columns s. Values may also be `Relation` objects.
 
+        Returns:
+            The factorization.
+
         Raises:
             NotationError: the text cannot be parsed; the message shows the column.
             ValueError: the text is valid, but the variables cannot be drawn (see the class).
@@ -260,7 +263,14 @@ class Factorization:
         return tuple(name for name in dict.fromkeys(parents) if name not in self.variables)
 
     def factor(self, name: str) -> Factor:
-        """Return the factor of a variable; raise ValueError if it has none."""
+        """Return the factor of a variable.
+
+        Args:
+            name: name of the variable.
+
+        Raises:
+            ValueError: the variable has no factor.
+        """
         for factor in self.factors:
             if factor.child == name:
                 return factor
@@ -300,6 +310,9 @@ class Factorization:
 
     def local(self, name: str) -> bool:
         """Return True for a variable with one value per time step, False for one with one value per sequence.
+
+        Args:
+            name: name of a variable or of context.
 
         Raises:
             ValueError: the factorization does not contain this name.
@@ -359,7 +372,12 @@ class Factorization:
         )
 
     def describe_edge(self, child: str, parent: Parent) -> str:
-        """Return one of the `edges`, (child, parent), in words, such as "x_{<t} to z_t"."""
+        """Return one of the `edges`, (child, parent), in words, such as "x_{<t} to z_t".
+
+        Args:
+            child: name of the variable that reads the parent.
+            parent: variable and steps that the child reads.
+        """
         return f"{parent} to {_plain(child, 't' if self.local(child) else None)}"
 
     def without(self, child: str, parent: Parent) -> Factorization:

@@ -55,6 +55,11 @@ class Attention:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: `heads` does not divide `width`, or the activation is unknown.
         """
@@ -77,6 +82,11 @@ class SelfAttention(Attention):
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SelfAttentionNetwork:  # type: ignore[override]
         """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: no parent of a local child is read over {1:T}, {<=t} or {>=t}, `heads` does not divide `width`,

@@ -55,10 +55,15 @@ class GraphConv:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GraphConvNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: the child is static, a size does not match the number of nodes, or no parent contains all nodes.
-                Also if the factor does not read the first step of a parent at every t, or `coefficients` is not between
-                1 and `length`.
+                Also if the factor does not read the same first steps of a parent at every t, or `coefficients` is not
+                between 1 and `length`.
         """
         return GraphConvNetwork(self, inputs, local, size)
 

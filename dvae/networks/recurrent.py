@@ -64,6 +64,11 @@ class Recurrent:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> RecurrentNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: an option is invalid, the parents do not match `stack` or `mean`, or a parent has a custom mask.
         """
@@ -491,6 +496,11 @@ class Dense:
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DenseNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: a parent is read over a range without end, or the activation or a width is invalid.

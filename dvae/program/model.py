@@ -244,6 +244,9 @@ class DynamicalVAE(nn.Module):
             coordinates: units of each coordinate, such as a column of a table; they replace the mean and scale that
                 `fit` would set.
 
+        Returns:
+            Units of the variable; their `fit` sets mean and scale from data.
+
         Raises:
             ValueError: if the variable is unknown.
         """
@@ -418,10 +421,19 @@ class DynamicalVAE(nn.Module):
     def guide(
         self, batch: AnyBatch, *, draws: Mapping[str, int] | None = None, curriculum: float = 1.0, **_: Any
     ) -> dict[str, Tensor]:
-        """Run the inference program q, with the arguments of `model`.
+        """Run the inference program q.
+
+        Args:
+            batch: data, as in `model`; it must include every data variable that the guide reads.
+            draws: dictionary from latent to a number of draws for each sequence, as in `model`.
+            curriculum: progress of the curriculum, from 0 to 1, as in `model`.
+            _: further arguments of `model`, which are ignored.
 
         Returns:
             Dictionary from latent to value.
+
+        Raises:
+            ValueError: the guide reads a variable that the batch does not contain, or the batch or `draws` is invalid.
         """
         self._register()
         self._check_draws(draws or {})
@@ -442,7 +454,15 @@ class DynamicalVAE(nn.Module):
         return values
 
     def forward(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
-        """Run `model`, which makes the module itself the Pyro model of `elbo(model, model.guide)`."""
+        """Run `model`, which makes the module itself the Pyro model of `elbo(model, model.guide)`.
+
+        Args:
+            batch: batch, as in `model`.
+            options: further arguments of `model`.
+
+        Returns:
+            Dictionary from variable to value, as from `model`.
+        """
         return self.model(batch, **options)
 
     @property
@@ -590,6 +610,10 @@ class DynamicalVAE(nn.Module):
         """Return log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
 
         A view that changes volume adds its log-determinant as one entry: the joint is a density of the data as given.
+
+        Args:
+            batch: batch, as in `model`.
+            latents: value of every latent by name, (B, T, D), or (B, D) for a static latent.
 
         Raises:
             ValueError: if a latent is missing or has the wrong shape.

@@ -296,7 +296,11 @@ class Oracle:
         return solved[..., :data], solved[..., data], solved[..., data + 1 :]
 
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """Return log p(x), (B,), of data (B, T, D), or of their observed entries."""
+        """Return log p(x), (B,), of data (B, T, D), or of their observed entries.
+
+        Args:
+            x: data (B, T, D), or a batch with data by name.
+        """
         batch = self.model.read(x)
         run = self._run(batch)
         evidence: Tensor = self._log_joint(run, *self._mixture(run)).logsumexp(1)
@@ -320,6 +324,9 @@ class Oracle:
 
         Latents are stacked in the guide's order. The covariance is (N, N). It is (B, N, N) for a batch with "mask" or
         "lengths", and for a model with discrete latents, whose posterior is a mixture.
+
+        Args:
+            x: data (B, T, D), or a batch with data by name.
         """
         run = self._run(x)
         logs, means, precision = self._mixture(run)
@@ -342,7 +349,14 @@ class Oracle:
         return means[..., :n] + (data[:, None] - means[..., n:]) @ gain.mT, within
 
     def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """Return the exact ELBO (B,) of the model's guide for data (B, T, D), computed in closed form."""
+        """Return the exact ELBO (B,) of the model's guide for data (B, T, D), computed in closed form.
+
+        Args:
+            x: data (B, T, D), or a batch with data by name.
+
+        Raises:
+            ValueError: a latent is summed out, so the posterior is a mixture.
+        """
         evidence = self.evidence(x)
         if not self.model.latents:
             return evidence
@@ -380,7 +394,17 @@ class Oracle:
 
     @torch.inference_mode(False)
     def fit_guide(self, iterations: int = 2000) -> float:
-        """Fit the guide to the model's exact KL gap by L-BFGS and return the remaining gap, in nats per sequence."""
+        """Fit the guide to the model's exact KL gap by L-BFGS.
+
+        Args:
+            iterations: maximum number of iterations.
+
+        Returns:
+            The remaining gap, in nats per sequence; 0 for a model without latents.
+
+        Raises:
+            ValueError: a latent is summed out, so the posterior is a mixture.
+        """
         if not self.model.latents:
             return 0.0
         parameters = list(self.model.encoder.parameters())

@@ -188,7 +188,11 @@ class Ablation(Result):
 
     @styled
     def plot(self) -> Figure:
-        """Draw model and guide of one step, with edges as wide as their cost, on surrogates and, if fitted, on data."""
+        """Draw model and guide of one step, with edges as wide as their cost, on surrogates and, if fitted, on data.
+
+        Returns:
+            A matplotlib figure.
+        """
         parts = [part for part in (self.generative, self.inference) if part.factors]
         on_surrogates = {run: float(np.mean(costs)) for run, costs in self.costs.items()}
         rows: list[tuple[str, dict[str, float], set[str]]] = [("nats a sequence, on surrogates", on_surrogates, set())]

@@ -66,6 +66,9 @@ class FactorizationContract:
 
         Args:
             size: dimension D of the data and, where free, of the other variables.
+
+        Raises:
+            NotImplementedError: a subclass does not implement the method.
         """
         raise NotImplementedError("subclass FactorizationContract and implement build(self, size) to return the model")
 

@@ -245,6 +245,9 @@ def calibrate(
         chunk: largest number of sequences times draws in memory.
         progress: whether to show a progress bar.
 
+    Returns:
+        Ranks (N, Q) of the simulated latents among the L draws of the guide, from 0 to L.
+
     Raises:
         ValueError: when a number is below 1, steps are beyond the length, context is missing, or the guide has no site
             for a latent.

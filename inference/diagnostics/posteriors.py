@@ -48,6 +48,9 @@ class Descent:
         renewed: number of steps between calls of `renew`.
         newton: number of Newton steps at the end, each with its own curvature.
 
+    Raises:
+        ValueError: an option is out of range, or there are more starts than candidates.
+
     Example:
         >>> quick = dvae.Descent(steps=50, starts=2)
     """
@@ -112,11 +115,23 @@ class Posterior:
         return split(self.factor.norm(dim=-1), self.mode)
 
     def draw(self, n: int, seed: int = 0) -> dict[str, Tensor]:
-        """Return draws (n, B, ...) of each latent from the normal."""
+        """Return draws (n, B, ...) of each latent from the normal.
+
+        Args:
+            n: number of draws for each sequence.
+            seed: seed of the draws.
+        """
         return split(joined(self.mode) + self._deviations(n, torch.Generator().manual_seed(seed)), self.mode)
 
     def guide(self, batch: Any = None) -> dict[str, Tensor]:
-        """Sample from the normal as a Pyro guide of the program, on the same batch."""
+        """Sample from the normal as a Pyro guide of the program, on the same batch.
+
+        Args:
+            batch: ignored; draws are for the batch of this posterior.
+
+        Returns:
+            Dictionary from latent to one draw (B, ...).
+        """
         with pyro.plate("sequences", len(self.factor)):
             distribution = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
             flat = pyro.sample("_latents", distribution, infer={"is_auxiliary": True})

@@ -111,6 +111,9 @@ class PredictionBands(Result):
 
         Before recalibration, the band is m ± q v, with q the quantile of the distances of each forecast from the
         others. Clips have equal weight in the scores, as in the calibration.
+
+        Args:
+            windows: windows to evaluate.
         """
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
@@ -205,7 +208,11 @@ class PredictionBands(Result):
 
     @styled
     def plot(self) -> Figure:
-        """Draw factors over the horizon, for single numbers as mean and range over coordinates."""
+        """Draw factors over the horizon, for single numbers as mean and range over coordinates.
+
+        Returns:
+            A matplotlib figure.
+        """
         figure = new_figure(4.5, 3)
         axes = figure.subplots()
         numbers = self.factors["number"]

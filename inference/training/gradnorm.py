@@ -87,7 +87,16 @@ class GradNorm:
         return self.weighted(terms, step, torch.ones(len(self.tasks)))
 
     def weighted(self, terms: "Terms", step: int, weights: Tensor) -> Tensor:
-        """Return the loss with the given weights (tasks,), a scalar."""
+        """Return the loss with the given weights (tasks,), a scalar.
+
+        Args:
+            terms: terms of the bound.
+            step: global step, for schedules of `others`.
+            weights: weights (tasks,), in the order of `tasks`.
+
+        Raises:
+            ValueError: the model has no log-likelihood or energy with the name of a task.
+        """
         other_terms = [
             {name: value for name, value in table.items() if name not in self.tasks}
             for table in (terms.log_likelihood, terms.energies)
@@ -98,7 +107,14 @@ class GradNorm:
         return loss
 
     def losses(self, terms: "Terms") -> list[Tensor]:
-        """Return the losses of the tasks in their order, scalars."""
+        """Return the losses of the tasks in their order, scalars, each divided by the number of frames.
+
+        Args:
+            terms: terms of the bound.
+
+        Raises:
+            ValueError: the model has no log-likelihood or energy with the name of a task.
+        """
         costs = {name: -value for name, value in terms.log_likelihood.items()} | terms.energies
         if unknown := [task for task in self.tasks if task not in costs]:
             raise ValueError(
@@ -108,7 +124,14 @@ class GradNorm:
         return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
 
     def begin(self, model: nn.Module) -> "Balance":
-        """Return the objective for a stage of a run, with its own weights, which start at 1."""
+        """Return the objective for a stage of a run, with its own weights, which start at 1.
+
+        Args:
+            model: model to train.
+
+        Raises:
+            ValueError: no trained parameter has a name that starts with `shared`.
+        """
         trained = {name: value for name, value in model.named_parameters() if value.requires_grad}
         shared = [value for name, value in trained.items() if name.startswith(self.shared)]
         if not shared:

@@ -185,6 +185,9 @@ class Segments:
             x: frames (B, N, D), one for each segment.
             shape: (B, S), shape parameters; default: those of the segments.
             fps: frames per second; default: the rate of the skeleton.
+
+        Returns:
+            Clips, one for each segment, at the original positions and headings.
         """
         offsets = self.body.offsets(self._batch[SHAPE] if shape is None else shape)
         return self.timed.back({**self._start, OFFSETS: offsets, WHOLE: x}, fps)
