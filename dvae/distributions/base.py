@@ -25,7 +25,7 @@ Parameters = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class Shape:
-    """Properties of the variable and of the features for which a conditional distribution is built.
+    """Properties of a variable and its features, for the construction of a conditional distribution.
 
     Args:
         size: D, dimension of the variable.

@@ -230,7 +230,7 @@ class Family:
 
 
 class FamilyModule(ConditionalDistribution):
-    """Distribution module of `Family`; its parameters are those of the distribution, each flattened to (..., P)."""
+    """Distribution module of `Family`; it returns each parameter of the distribution flattened to (..., P)."""
 
     def __init__(self, spec: Family, shape: Shape):
         super().__init__(spec.residual)

@@ -197,8 +197,8 @@ class Factorization:
     """A joint distribution over sequences, as a product of conditional distributions.
 
     Create it with `parse`. Construction checks that the variables can be drawn in some order. If variables depend on
-    each other in a cycle, the error shows the cycle. The order in which the factors are written matters only if several
-    drawing orders are valid.
+    each other in a cycle, the error shows the cycle. The order of the written factors matters only if several drawing
+    orders are valid.
 
     Args:
         kind: "p" for a generative model, "q" for a guide.

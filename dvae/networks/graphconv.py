@@ -36,8 +36,8 @@ class GraphConv:
 
     Args:
         nodes: {name of a local variable: indices of its nodes}, for the child and all local parents. All nodes have
-            the same number of coordinates. One parent must contain all nodes. Its trajectories are the input, in which
-            the other parents replace the trajectories of their nodes.
+            the same number of coordinates. One parent must contain all nodes. Its trajectories are the input; the other
+            parents replace the trajectories of their nodes in it.
         child: name of the child.
         length: T, number of steps of every sequence.
         coefficients: C, number of cosine coefficients per trajectory, at most T.

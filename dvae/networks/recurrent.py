@@ -117,7 +117,7 @@ class Memory(nn.Module):
         return memoize(self, self.key(keys, lengths), lambda: self._states(values, keys, lengths))
 
     def key(self, keys: Mapping[str, Tensor], lengths: Tensor | None) -> list[Tensor | None]:
-        """Return the tensors that determine the states, as the key under which `memoize` stores these."""
+        """Return the tensors that determine the states; `memoize` uses them as the key of the stored states."""
         return [*(keys[parent.name] for parent, _ in self.entries), lengths]
 
     def _states(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
@@ -422,7 +422,7 @@ class RecurrentState:
 
 
 def tie(first: Any, *others: Any) -> None:
-    """Replace the forward memory of other recurrent networks, and its extractors, by those of the first network.
+    """Make other recurrent networks use the forward memory of the first network, including its extractors.
 
     All forward memories must read the same parents at the same lags. Within `loop.memoizing`, their states are computed
     once for all networks.

@@ -2,7 +2,7 @@
 
 The programs have one sample site per variable, whatever the number of steps. A static `w` has the event shape (D,),
 local `z` and `x` have (T, D), all inside the plate "sequences". Free runs, forecasts, reconstructions and scores use
-the same program and differ only in which values are given.
+the same program with different given values.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class DynamicalVAE(nn.Module):
             the programs draw it once for all sequences of the batch. A forecast draws it once for each sample.
         grouped: static latents that the sequences of a group share. A batch gives the groups as "group" (B,); without
             it, every sequence is its own group (`dvae.program.groups`).
-        indicators: data variables for which the guide also reads which entries were observed. Each coordinate has an
+        indicators: data variables whose pattern of missing entries the guide also reads. Each coordinate has an
             indicator of 0 or 1, all 1 without a mask (Collier et al., 2020, arXiv 2006.05301). Without indicators, the
             guide cannot distinguish a missing entry from one observed at 0, or at the mean of a variable with units.
 
@@ -356,6 +356,10 @@ class DynamicalVAE(nn.Module):
 
         Returns:
             Dictionary from variable name to value.
+
+        Raises:
+            ValueError: the batch, `draws` or the prefix has an unknown name or a wrong shape, or the length is not
+                known.
         """
         self._register()
         self._check_draws(draws or {})
@@ -571,7 +575,7 @@ class DynamicalVAE(nn.Module):
             batch: batch with a "mask", as in `model`.
             samples: S, draws of the latents for each sequence.
             draw: draw the missing entries (True) or use their means (False); None uses `is_drawn`.
-            particles: K, number of draws from which each sample is chosen.
+            particles: K, number of candidates for each sample.
             chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
@@ -690,8 +694,8 @@ class DynamicalVAE(nn.Module):
 
         Args:
             values: dictionary from data variable to values (..., B, T, D) in the model's representation.
-            data: the batch that they belong to, as returned by `read`. It contains what the inverse of the view needs,
-                such as a heading; without it, that part of the transformation is not inverted.
+            data: the batch of these values, as returned by `read`. It contains inputs of the inverse, such as headings;
+                without them, this part of the transformation is not inverted.
 
         Returns:
             The values in data space; if the view splits the data into parts, also the whole array.

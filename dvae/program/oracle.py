@@ -591,7 +591,7 @@ def edge_costs(
 
     Args:
         generative, inference, observed: as in `DynamicalVAE`.
-        sizes: dimension of every variable; 1 each by default, for which a faithful guide has no cost.
+        sizes: dimension of every variable; 1 each by default; a faithful guide then has no KL gap.
         steps: as in `kl_gap`.
         seeds: as in `kl_gap`.
 

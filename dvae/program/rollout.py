@@ -182,8 +182,8 @@ class Rollout:
         lengths: (B,) valid steps of a ragged batch.
         observed: dictionary from data variable to (B, T, D), True where an entry was observed. At other entries, the
             model reads its own mean and the guide reads 0.
-        present: dictionary from local latent to (B, T), False at steps at which it is integrated out. Its density does
-            not count there, and networks that read it also read this mask (`networks.base.presence`).
+        present: dictionary from local latent to (B, T), False at steps where it is integrated out. Its density does not
+            count there, and networks that read it also read this mask (`networks.base.presence`).
         prefix: dictionary from variables that the run continues to their first values (B, O, D).
         mean_emission: names of data variables that are set to their means instead of drawn.
         feeding: replacement for the data's history, a `ScheduledSampling` or `InputNoise`; None keeps the history.
@@ -654,7 +654,7 @@ class Sequence(TorchDistribution):
         return entries.sum(-1) if entries.dim() == 3 else entries
 
     def scored(self, value: Tensor) -> Tensor:
-        """Return the value at which densities are evaluated (`Conditional.scored`)."""
+        """Return the value whose density is evaluated (`Conditional.scored`)."""
         return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Sequence:

@@ -259,7 +259,7 @@ def edge_of(part: Factorization, child: str, parent: Parent) -> AblatedEdge:
 
 
 def as_equations(method: Method | tuple[str, str], schema: Schema | None = None) -> Equations:
-    """Return a method as `Equations`, with networks of one kind and those of its options that `Equations` has.
+    """Return a method as `Equations`, with networks of one kind and all options that `Equations` also has.
 
     Args:
         method: one of `FAMILY`, `equations`, or a pair of equations (generative, inference).

@@ -173,7 +173,7 @@ class PanelData:
         """Return one window for each sequence; its future follows the last target, as in `dvae.tables.ahead`.
 
         Args:
-            horizon: steps of the future; by default those of the schema.
+            horizon: steps of the future; the horizon of the schema by default.
 
         Raises:
             ValueError: if sequences are not cut into windows, are too short, or have no covariates of the future.

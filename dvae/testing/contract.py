@@ -120,7 +120,7 @@ class FactorizationContract:
         self._close(draw_logs, _run(poutine.condition(model.guide, data=latents), data)[1])
 
     def test_the_log_joint_is_that_of_the_per_step_program(self) -> None:
-        """Log densities of the program equal those of a loop over time with one site per variable and step."""
+        """The program and a loop over time with one site per variable and step give equal log densities."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)

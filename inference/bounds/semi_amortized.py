@@ -95,7 +95,7 @@ class Correction:
         unit: standard deviations (B, S, D) of the guide before the correction.
         shift: shift (B, S, D) of the location, in units.
         stretch: shift (B, S, D) of the logarithm of the scale.
-        links: linear terms by which the location depends on draws of other latents, one for each latent.
+        links: linear functions of draws of other latents, one for each latent, which are added to the location.
     """
 
     unit: Tensor
@@ -193,7 +193,7 @@ class CorrectedConditional(nn.Module):
             state: result of `start` or of the previous step.
             t: index of the step, from 0.
             samples: values (B, D) by step of the variables that the loop draws, by name.
-            count: number of steps that are evaluated at once, the last being t.
+            count: number of steps that are evaluated at once; t is the last of them.
 
         Raises:
             ValueError: the batch has other sequences than those that the correction was fitted to.

@@ -100,7 +100,7 @@ def filtered(
         parts: slices of the sequences, evaluated one after another.
 
     Raises:
-        FloatingPointError: a bound is not finite.
+        FloatingPointError: when a bound is not finite.
     """
     values = []
     for part in parts:

@@ -87,7 +87,10 @@ class Calibration(Result):
 
     @property
     def bias(self) -> np.ndarray:
-        """Mean of the truth minus the guide's mean, in the guide's standard deviations, (Q,); see `spread`."""
+        """Mean of the truth minus the guide's mean, in standard deviations of the guide, (Q,).
+
+        It is estimated by maximum likelihood from the ranks, like `spread`.
+        """
         return self._normals[:, 0]
 
     @property

@@ -79,8 +79,8 @@ class Posterior:
         course: energies during the search from the start that reached the lowest, (steps, B).
         left: reduction of the energy that another Newton step would give for a quadratic energy, in nats, (B,); about 0
             after convergence.
-        bent: number of directions in which the energy has less curvature than the prior's, (B,). There the normal is as
-            wide as the prior, because otherwise it would be wider or have no finite width.
+        bent: number of directions with less curvature of the energy than the prior has, (B,). In these directions, the
+            normal is as wide as the prior; otherwise it would be wider or have no finite width.
         factor: lower triangular factor of the covariance of all latent numbers of a sequence, in the order of `mode`,
             (B, P, P).
 

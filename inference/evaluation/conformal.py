@@ -364,7 +364,7 @@ def conformal_bands(
 def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
     """Return values by clip whose mean, weighted by numbers of windows, is the plain mean over clips.
 
-    The standard error is also that of the plain mean.
+    The standard error also equals the standard error of the plain mean.
 
     Args:
         values: score of every window, `(N,)`.

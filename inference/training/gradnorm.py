@@ -45,9 +45,9 @@ class GradNorm:
         tasks: names of log-likelihoods and energies, at least two.
         shared: prefix of the names of the parameters W, such as a last layer that all tasks use.
         others: objective that weighs all other terms, including the KL, and defines `draws` and `select`.
-        asymmetry: a, the strength with which slowly training tasks are favoured. At 0, norms of gradients are
-            equalised. Above 0, losses must be positive, which negative log densities need not be. The paper uses 0.12,
-            and 1.5 if tasks differ more.
+        asymmetry: a, how strongly the weights favour slowly training tasks. At 0, norms of gradients are equalised.
+            Above 0, losses must be positive; negative log densities may violate this. The paper uses 0.12, and 1.5 if
+            tasks differ more.
         learning_rate: learning rate of log w, the change per step for a task whose gradient has the mean norm.
 
     Raises:

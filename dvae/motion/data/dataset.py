@@ -51,7 +51,7 @@ def apply_splits(motion: MotionSet, protocol: Protocol) -> MotionSet:
 
 @dataclass(frozen=True)
 class Recordings:
-    """Record of the file from which motion data were read.
+    """Record of the file that contains motion data.
 
     Args:
         path: file as it was given, or "simulated".

@@ -55,8 +55,8 @@ class Protocol:
         train_stride, test_stride: frames between the starts of successive windows, where windows are listed and not
             drawn, for training and for test.
         root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1). "relative": all
-            frames are relative to one position, the pelvis in the first frame of the window in which it was observed.
-            Global motion is then kept, and D = 3 J.
+            frames are relative to one position, the first observed pelvis of the window. Global motion is then kept,
+            and D = 3 J.
         multimodal_threshold: distance in metres. If the last observed poses of test windows are closer than this, the
             futures of all these windows are possible futures of each.
         split_by: "split", or the label that assigns clips to splits.

@@ -36,7 +36,7 @@ def subsample_clips(clips: Sequence[Clip], many: int) -> list[Clip]:
 
 @dataclass(frozen=True)
 class SegmentSource:
-    """Record of the file and the options from which segments were read.
+    """Record of the file of the segments, and of the options for reading it.
 
     Args:
         path: path of the file as the user gave it, or "simulated".
