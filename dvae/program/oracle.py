@@ -54,6 +54,9 @@ def linear_gaussian_surrogate(
         seed: random seed of the weights.
         scale: standard deviation of the weights.
 
+    Raises:
+        ValueError: a text cannot be parsed, or the guide does not fit the model.
+
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
@@ -372,7 +375,11 @@ class Oracle:
         return evidence - self._divergence(distance, precision, root)
 
     def gap(self) -> Tensor:
-        """Return the KL gap: expected evidence minus bound, in nats per sequence, over complete data from the model."""
+        """Return the KL gap: expected evidence minus bound, in nats per sequence, over complete data from the model.
+
+        Raises:
+            ValueError: a latent is summed out, so the posterior is a mixture.
+        """
         gain, offset, root = (part[0] for part in self._guide())
         mean, precision = self._joint()
         n = len(offset)
@@ -448,7 +455,8 @@ def kl_gap(
         seeds: number of random models.
 
     Raises:
-        ValueError: `steps` or `seeds` is less than 1, a text cannot be parsed, or the guide does not fit the model.
+        ValueError: `steps` or `seeds` is less than 1, a text cannot be parsed, the guide does not fit the model, or a
+            latent is `Discrete`.
 
     Example:
         >>> dvae.kl_gap("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, steps=3, seeds=1) > 0
@@ -598,6 +606,10 @@ def edge_costs(
     Returns:
         {edge: (seeds,), increase of the KL gap without the edge in each random model}, largest mean first.
 
+    Raises:
+        ValueError: `steps` or `seeds` is less than 1, a text cannot be parsed, the guide does not fit the model, or a
+            latent is `Discrete`.
+
     Example:
         >>> {edge: bool((cost > 0).all()) for edge, cost in dvae.edge_costs(
         ...     "p(z_t) p(x_t | z_t)", "q(z_t | x_t, z_{t-1})", steps=3, seeds=2).items()}
@@ -630,6 +642,9 @@ def model_edge_costs(
 
     Returns:
         {edge: (seeds,), loss of evidence without the edge in each random model}, largest mean first.
+
+    Raises:
+        ValueError: `steps` or `seeds` is less than 1, or the text cannot be parsed.
 
     Example:
         >>> {edge: bool((cost > 1e-6).all()) for edge, cost in dvae.model_edge_costs(

@@ -98,7 +98,7 @@ class ScheduledSampling:
         return mask
 
     def fixed_frames(self, length: int) -> list[bool] | None:
-        """Return which of T frames stay unchanged, if this is not random; otherwise None.
+        """Return whether each of T frames stays unchanged, as T booleans; None if this is random.
 
         Args:
             length: T, number of frames.

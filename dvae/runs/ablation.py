@@ -332,6 +332,9 @@ def ablate(
         seed: seed of the draws of the IWAE bound.
         progress: whether to show a progress bar.
 
+    Returns:
+        Costs of each edge in nats per sequence on the surrogates and, with data, in nats per frame.
+
     Raises:
         ValueError: the method is not defined by its equations alone; data without `out`; the guide does not draw a
             latent; as in `sweep`, `kl_gap` and `compare`.

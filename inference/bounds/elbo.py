@@ -110,6 +110,9 @@ class SequenceELBO(ELBO):
             guide: guide; the model's own by default.
             options: options of the program, such as `scheduled_sampling`.
 
+        Returns:
+            Terms in nats, (B,) each.
+
         Raises:
             ValueError: when a site is scaled, or missing in guide or model.
         """

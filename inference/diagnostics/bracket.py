@@ -116,6 +116,9 @@ class Bracket(Result):
             data: "real", with errors clustered by clip, or "simulated".
             frame: whether to return nats per frame instead of per sequence.
 
+        Returns:
+            Mean with its standard error, in nats.
+
         Raises:
             KeyError: when the bound does not exist for these data.
         """

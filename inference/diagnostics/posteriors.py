@@ -151,6 +151,12 @@ class Posterior:
             particles: K, number of particles.
             seed: seed of the draws.
             chunk: largest number of sequences times particles in memory.
+
+        Returns:
+            Log evidence and k-hat, (B,) each.
+
+        Raises:
+            ValueError: a site of the program has no separate log-density for each sequence.
         """
         generator = torch.Generator().manual_seed(seed)
         distribution = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)

@@ -195,7 +195,7 @@ class MotionData:
             path: current path, if the data have moved.
 
         Returns:
-            The data.
+            Clips of the file, with the protocol of the schema.
 
         Raises:
             FileNotFoundError, ValueError: same as `open`.

@@ -211,7 +211,7 @@ class SegmentData:
             path: path of the data now, or of other data; default: the recorded path.
 
         Returns:
-            The data.
+            Segments of the file, with the conversion to frames of the schema.
 
         Raises:
             FileNotFoundError, ValueError: same as `open`.
