@@ -345,6 +345,10 @@ class Factorization:
             Bool array (T or 1, T or 1): T for a local variable, 1 for a static one. The shape is (T, T) for a local
             child and parent, (T, 1) for a static parent and (1, T) for a static child of a local parent. All entries
             are False if the child does not read the parent.
+
+        Raises:
+            ValueError: the child has no factor, the factorization has no variable with the name of the parent, or a
+                custom mask has a wrong shape or dtype.
         """
         factor = self.factor(child)
         if factor.parent(parent) is None:

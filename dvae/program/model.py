@@ -498,6 +498,9 @@ class DynamicalVAE(nn.Module):
 
         Returns:
             Dictionary from variable name to draws (n, T, D), or (n, D) for a static latent.
+
+        Raises:
+            ValueError: the batch is invalid, or the length is not known.
         """
         with self.running():
             data = self.read(batch, size=n)

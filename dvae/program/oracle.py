@@ -303,6 +303,9 @@ class Oracle:
 
         Args:
             x: data (B, T, D), or a batch with data by name.
+
+        Raises:
+            ValueError: the batch has no value of a data variable, another number of steps, or groups.
         """
         batch = self.model.read(x)
         run = self._run(batch)
@@ -330,6 +333,9 @@ class Oracle:
 
         Args:
             x: data (B, T, D), or a batch with data by name.
+
+        Raises:
+            ValueError: the batch has no value of a data variable, another number of steps, or groups.
         """
         run = self._run(x)
         logs, means, precision = self._mixture(run)
@@ -358,7 +364,7 @@ class Oracle:
             x: data (B, T, D), or a batch with data by name.
 
         Raises:
-            ValueError: a latent is summed out, so the posterior is a mixture.
+            ValueError: same as `evidence`, or a latent is summed out, so the posterior is a mixture.
         """
         evidence = self.evidence(x)
         if not self.model.latents:

@@ -79,6 +79,10 @@ class Cut:
         Args:
             panel: the sequences.
             split: "train", "validation" or "test", several joined by "+", or "all" or "last".
+
+        Raises:
+            ValueError: only some sequences state their split, groups are missing, or there are too few sequences to
+                split.
         """
         windows = []
         for index, low, high in self.spans(panel, split):
@@ -94,6 +98,10 @@ class Cut:
         Args:
             panel: the sequences.
             split: "train", "validation" or "test", several joined by "+", or "all" or "last".
+
+        Raises:
+            ValueError: only some sequences state their split, groups are missing, or there are too few sequences to
+                split.
         """
         spans = []
         everywhere = split in ("all", "last")

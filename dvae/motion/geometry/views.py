@@ -86,6 +86,9 @@ class Heading(View):
 
         Args:
             x: windows (..., T, D), or poses (..., D), in metres.
+
+        Raises:
+            ValueError: D does not match the skeleton.
         """
         frames = x[..., None, :] if self.pose else x
         return self.skeleton.heading_near(self._joints(frames), min(self.frames, frames.shape[-2]) - 1)
