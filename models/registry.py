@@ -167,6 +167,10 @@ def metric_models() -> Registry:
 def method(name: str, **options: Any) -> Method:
     """Return a method by its name, with options in place of its defaults.
 
+    Args:
+        name: name of a method, one of `methods()`, such as "srnn".
+        options: values that replace the defaults of the method's fields.
+
     Raises:
         ValueError: if the name or an option is unknown; the message names the nearest known one.
 

@@ -93,7 +93,7 @@ class Schema:
 
     @property
     def windows(self) -> Schema:
-        """Schema of the same data without a view; runs for which it is equal can be evaluated on the same windows."""
+        """Schema of the same data without a view; runs can be evaluated on the same windows if it is equal."""
         return self
 
     @classmethod

@@ -80,7 +80,7 @@ class Coordinate(NamedTuple):
     Args:
         mean, scale: mean and scale that standardise the values.
         typical: replacement for a missing value.
-        floor: lower limit to which values are clipped before networks read their logarithms; 0 if networks read values.
+        floor: lower limit for clipping values before networks read their logarithms; 0 if networks read values.
         level, spread: mean and standard deviation of the logarithms.
     """
 

@@ -77,6 +77,9 @@ class View:
         Args:
             model_values: values (..., B, T, D) by name in the model's representation, and the values (B, ...) that the
                 view added.
+
+        Returns:
+            Values (..., B, T, D) by name in the data's representation.
         """
         return model_values
 
@@ -85,6 +88,9 @@ class View:
 
         A view that transforms each entry of x separately returns a value for each entry, (B, T, D), and the sum omits
         missing entries and padding. Any other view that changes volume requires complete data.
+
+        Args:
+            data: batch in the data's representation.
         """
         some = next(iter(data.values()))
         zeros: Tensor = some.new_zeros(len(some))
@@ -99,6 +105,9 @@ class View:
         """Return `log_det` without missing entries and padding.
 
         It is summed over coordinates, (B, T), if the view returns a value for each entry; otherwise it is (B,).
+
+        Args:
+            data: batch in the data's representation.
 
         Raises:
             ValueError: if the view returns one value per sequence, but some entries are missing or padding, or if the

@@ -25,7 +25,7 @@ Parameters = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class Shape:
-    """Properties of the variable and of the features for which a conditional distribution is built.
+    """Properties of a variable and its features, for the construction of a conditional distribution.
 
     Args:
         size: D, dimension of the variable.
@@ -154,6 +154,9 @@ class ConditionalDistribution(nn.Module):
             previous: values of the variable one step earlier, (B, T, D) or (B, D), for a residual distribution;
                 otherwise None.
             t: step in a loop over time, or the first of several steps, counted from 0; None for all steps.
+
+        Raises:
+            NotImplementedError: a subclass does not implement the method.
         """
         raise NotImplementedError
 
@@ -165,6 +168,9 @@ class ConditionalDistribution(nn.Module):
 
         Args:
             parameters: result of `forward`.
+
+        Raises:
+            NotImplementedError: a subclass does not implement the method.
         """
         raise NotImplementedError
 
@@ -198,6 +204,9 @@ class ConditionalDistribution(nn.Module):
             parameters: result of `forward`.
             mean: mean of the variable in its own unit, (D,).
             scale: scale of the variable in its own unit, (D,) or a single number.
+
+        Returns:
+            Parameters with the same shapes, in the variable's own unit.
         """
         loc, *rest = parameters
         return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]

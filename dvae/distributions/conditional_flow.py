@@ -45,6 +45,9 @@ class ConditionalFlow:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: `steps` is less than 1, or the bound is not positive.
             ImportError: zuko is not installed.

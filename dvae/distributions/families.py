@@ -80,7 +80,11 @@ class Normal:
     residual: float = False
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Args:
+            shape: the variable and its features.
+        """
         return NormalModule(self, shape)
 
 
@@ -129,6 +133,9 @@ class FixedNormal:
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
+
+        Args:
+            shape: the variable and its features.
 
         Raises:
             ValueError: `scale` is not positive, `steps` is given for a static variable, or the number of features is
@@ -205,6 +212,9 @@ class KnownNoise:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: the features do not include a scale, because the network is not a `networks.WithNoise`.
         """
@@ -253,6 +263,9 @@ class StudentT:
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
+
+        Args:
+            shape: the variable and its features.
 
         Raises:
             ValueError: `df` is at most 2.
@@ -325,6 +338,9 @@ class Delta:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: the number of features is not D.
         """
@@ -379,6 +395,9 @@ class Directions:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: D is not divisible by 3, or the number of features is not D although `project` is False.
         """
@@ -411,7 +430,11 @@ class StandardNormal:
     """The fixed distribution N(0, I), which ignores features; the default for a model variable without parents."""
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Args:
+            shape: the variable and its features.
+        """
         return StandardNormalModule(shape.size)
 
 

@@ -1,13 +1,13 @@
-"""Use any Pyro distribution as a conditional distribution, and define named families for observations.
+"""Conditional distributions from any distribution of Pyro, and named families for observations.
 
-A distribution declares the constraints of its parameters (`arg_constraints`). `biject_to` of torch maps the output of a
-linear layer to values that satisfy them. For example, a rate is the exponential of the output, and a scale matrix has a
-positive diagonal.
+A distribution declares the constraints of its parameters (`arg_constraints`). A linear layer computes unconstrained
+numbers, and torch's `biject_to` maps them to parameters that satisfy the constraints. For example, a rate is the
+exponential of the output, and a scale matrix has a positive diagonal.
 
 | family | observations | distribution |
 |---|---|---|
 | real | numbers | `Normal` |
-| fixed | numbers, with one scale per coordinate that does not depend on the parents | `FixedNormal` |
+| fixed | numbers; the scale of each coordinate does not depend on the parents | `FixedNormal` |
 | robust, laplace | numbers with outliers | `StudentT`, Laplace |
 | mixture | numbers with several modes | `NormalMixture` |
 | correlated | correlated numbers | `LowRankNormal` |
@@ -17,11 +17,11 @@ positive diagonal.
 | share | above 0 and below 1 | Beta |
 | binary | 0 or 1 | Bernoulli |
 | category | one of D classes, one-hot encoded in D coordinates | OneHotCategorical |
-| count, overdispersed | non-negative integers; those with a larger variance than Poisson | Poisson, negative binomial |
+| count, overdispersed | non-negative integers; the same with a larger variance | Poisson, negative binomial |
 | sparse, sparse-overdispersed | like the previous two, with excess zeros | zero-inflated Poisson, negative binomial |
 
 For a power spectrum, the negative log density equals the Itakura-Saito divergence from the mean, up to terms that
-depend only on the data. It is the likelihood of complex normals whose variance is that mean (Févotte, Bertin and
+depend only on the data. It is the likelihood of complex normals with this mean as variance (Févotte, Bertin and
 Durrieu, 2009). The speech models in the review of Girin et al. (2021, arXiv 2008.12595) use it.
 """
 
@@ -218,16 +218,19 @@ class Family:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
-            ValueError: Pyro has no such distribution, it does not declare constraints of its parameters, a parameter is
-                unknown or must be given, all parameters are given, or the distribution does not fit `residual` or the
-                number of features.
+            ValueError: Pyro has no such distribution, or the distribution does not declare constraints. Also if a
+                parameter is unknown, a parameter that must be given is missing, or all parameters are given. Also if
+                the distribution does not support `residual` or the number of features.
         """
         return FamilyModule(self, shape)
 
 
 class FamilyModule(ConditionalDistribution):
-    """Distribution module of `Family`; its parameters are those of the distribution, each flattened to (..., P)."""
+    """Distribution module of `Family`; it returns each parameter of the distribution flattened to (..., P)."""
 
     def __init__(self, spec: Family, shape: Shape):
         super().__init__(spec.residual)
@@ -435,6 +438,9 @@ class NormalMixture:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: `components` is less than 1.
         """
@@ -497,7 +503,11 @@ class LowRankNormal:
     residual: float = False
 
     def build(self, shape: Shape) -> ConditionalDistribution:
-        """Return the module for a variable of this shape."""
+        """Return the module for a variable of this shape.
+
+        Args:
+            shape: the variable and its features.
+        """
         family = Family(
             "LowRankMultivariateNormal", {}, (), {"cov_factor": (-1, self.rank)}, self.min_scale, self.residual
         )

@@ -45,6 +45,9 @@ class QRFlow:
     def build(self, shape: Shape) -> QRFlowModule:
         """Return the module for a static latent without parents.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: the variable is not a static latent without parents, or its size or the number of layers is less
                 than 1.
@@ -209,16 +212,29 @@ class FlowDistribution(TorchDistribution):
         super().__init__(torch.Size(batch_shape), like.shape[-1:], validate_args=False)
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
-        """Return reparameterised draws (*sample_shape, *batch_shape, D)."""
+        """Return reparameterised draws (*sample_shape, *batch_shape, D).
+
+        Args:
+            sample_shape: shape of the draws.
+        """
         shape = self._extended_shape(torch.Size(sample_shape))
         return self.flow.from_noise(torch.randn(shape, dtype=self.like.dtype, device=self.like.device))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log densities (...) of values (..., D), in nats."""
+        """Return the log densities (...) of values (..., D), in nats.
+
+        Args:
+            value: values (..., D).
+        """
         noise, log_det = self.flow.to_noise(value)
         density = log_det - noise.square().sum(-1) / 2 - self.event_shape[0] / 2 * math.log(2 * math.pi)
         return density.expand(torch.broadcast_shapes(density.shape, self.batch_shape))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> FlowDistribution:
-        """Return the distribution with another batch shape."""
+        """Return the distribution with another batch shape.
+
+        Args:
+            batch_shape: new batch shape.
+            _instance: ignored; part of Pyro's signature.
+        """
         return FlowDistribution(self.flow, self.like, batch_shape)

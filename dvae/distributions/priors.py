@@ -69,6 +69,9 @@ class Mixture:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a static latent without parents.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: the variable is not a static latent without parents.
         """
@@ -110,6 +113,9 @@ class Vamp:
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a static latent without parents.
+
+        Args:
+            shape: the variable and its features.
 
         Raises:
             ValueError: the variable is not a static latent without parents, or its guide reads something other than
@@ -191,6 +197,9 @@ class Flow:
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a static latent without parents.
+
+        Args:
+            shape: the variable and its features.
 
         Raises:
             ValueError: the variable is not a static latent without parents.

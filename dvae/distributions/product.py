@@ -44,6 +44,9 @@ class Product:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: a coordinate is in no part, or in more than one; a part has no density.
         """

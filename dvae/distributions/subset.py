@@ -41,7 +41,11 @@ class Subset:
         check(self)
 
     def chosen(self, size: int) -> int:
-        """Return how many of `size` indices are chosen."""
+        """Return how many of `size` indices are chosen.
+
+        Args:
+            size: number of indices.
+        """
         return ceil(self.share * size - 1e-9)  # rounding error must not turn 0.3 * 10 into 4
 
     def distribution(self, size: int, curriculum: float = 1.0) -> SubsetDistribution:

@@ -28,6 +28,9 @@ class Triangular:
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
 
+        Args:
+            shape: the variable and its features.
+
         Raises:
             ValueError: the number of features is not D + D^2.
         """

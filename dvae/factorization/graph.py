@@ -99,7 +99,7 @@ class _TextTable:
 
 @dataclass(frozen=True)
 class Audit(_TextTable):
-    """Comparison of the variables that a guide reads with those that the exact posterior depends on.
+    """Comparison of the parents that a guide reads with the parents that the exact posterior depends on.
 
     Printing an audit shows a table with one row per guide factor.
 
@@ -107,12 +107,12 @@ class Audit(_TextTable):
         generative: factorization p of the model.
         inference: factorization q of the guide.
         observed: names of the observed variables.
-        missing_parents: dictionary from latent to the parents that its exact posterior depends on, but its guide factor
-            does not read. The bound can be tight only if there are none.
-        redundant_parents: dictionary from latent to the parents that its guide factor reads, although the latent is
-            independent of them given the other parents. The guide loses nothing without them.
-        steps: length T for which the audit holds if there are custom masks, which may differ between lengths. None
-            without custom masks; the audit then holds for all lengths.
+        missing_parents: parents of each latent that its exact posterior depends on and its guide factor does not read.
+            With missing parents, the bound cannot be tight.
+        redundant_parents: parents of each latent that its guide factor reads, although the latent is independent of
+            them given the other parents. Removing them does not loosen the bound.
+        steps: with custom masks, the only length T to which the audit applies. None without custom masks: the audit
+            then applies to all lengths.
         summed: names of latents that are summed out.
 
     Example:
@@ -391,7 +391,9 @@ class Alternatives(_TextTable):
 def alternatives(
     generative: Factorization | str, observed: Iterable[str] = ("x",), steps: int = 10, summed: Iterable[str] = ()
 ) -> Alternatives:
-    """Return all guides that `faithful_inverse` derives, one for each drawing order in `orders`, without duplicates.
+    """Return the distinct guides that `faithful_inverse` derives over all drawing orders.
+
+    Each drawing order in `orders` gives one guide. Orders with equal guides count once.
 
     Args:
         generative: p, a factorization or its text.

@@ -1,6 +1,6 @@
-r"""Parse equations in the notation of papers into factorizations.
+r"""Parse equations, written as in papers, into factorizations.
 
-A factorization states which variables each factor reads, and at which time steps:
+A factorization is a product of factors. Each factor lists the variables and the time steps that it reads:
 
     p(w) p(z_t | z_{<t}, x_{t-1}, w) p(x_t | x_{<t}, z_t, w)
 
@@ -197,8 +197,8 @@ class Factorization:
     """A joint distribution over sequences, as a product of conditional distributions.
 
     Create it with `parse`. Construction checks that the variables can be drawn in some order. If variables depend on
-    each other in a cycle, the error shows the cycle. The order in which the factors are written matters only if several
-    drawing orders are valid.
+    each other in a cycle, the error shows the cycle. The order of the written factors matters only if several drawing
+    orders are valid.
 
     Args:
         kind: "p" for a generative model, "q" for a guide.
@@ -232,6 +232,9 @@ class Factorization:
             masks: custom relations; `masks={"band": function}` defines `z_{band}`, where function(T) returns a bool
                 array (T, T) with rows t and columns s. Values may also be `Relation` objects.
 
+        Returns:
+            The factorization.
+
         Raises:
             NotationError: the text cannot be parsed; the message shows the column.
             ValueError: the text is valid, but the variables cannot be drawn (see the class).
@@ -260,7 +263,14 @@ class Factorization:
         return tuple(name for name in dict.fromkeys(parents) if name not in self.variables)
 
     def factor(self, name: str) -> Factor:
-        """Return the factor of a variable; raise ValueError if it has none."""
+        """Return the factor of a variable.
+
+        Args:
+            name: name of the variable.
+
+        Raises:
+            ValueError: the variable has no factor.
+        """
         for factor in self.factors:
             if factor.child == name:
                 return factor
@@ -301,6 +311,9 @@ class Factorization:
     def local(self, name: str) -> bool:
         """Return True for a variable with one value per time step, False for one with one value per sequence.
 
+        Args:
+            name: name of a variable or of context.
+
         Raises:
             ValueError: the factorization does not contain this name.
         """
@@ -332,6 +345,10 @@ class Factorization:
             Bool array (T or 1, T or 1): T for a local variable, 1 for a static one. The shape is (T, T) for a local
             child and parent, (T, 1) for a static parent and (1, T) for a static child of a local parent. All entries
             are False if the child does not read the parent.
+
+        Raises:
+            ValueError: the child has no factor, the factorization has no variable with the name of the parent, or a
+                custom mask has a wrong shape or dtype.
         """
         factor = self.factor(child)
         if factor.parent(parent) is None:
@@ -359,7 +376,12 @@ class Factorization:
         )
 
     def describe_edge(self, child: str, parent: Parent) -> str:
-        """Return one of the `edges`, (child, parent), in words, such as "x_{<t} to z_t"."""
+        """Return one of the `edges`, (child, parent), in words, such as "x_{<t} to z_t".
+
+        Args:
+            child: name of the variable that reads the parent.
+            parent: variable and steps that the child reads.
+        """
         return f"{parent} to {_plain(child, 't' if self.local(child) else None)}"
 
     def without(self, child: str, parent: Parent) -> Factorization:

@@ -53,7 +53,7 @@ def follow_paths(
 
     Args:
         decode: function from latents (1, ...) to motions (1, T, D) in metres.
-        latents: (S, ...) draws z_k, from which the fits of S motions start.
+        latents: (S, ...) draws z_k, the starts of the fits of S motions.
         scale: positive scale s of the latents under the prior; broadcasts against the latents of one motion.
         paths: (T, D) joint positions to follow, in metres.
         mask: (T, D), 1 where a path is known and 0 where `paths` is ignored.

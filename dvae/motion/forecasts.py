@@ -16,7 +16,11 @@ from .geometry.skeleton import FIELDS, Skeleton
 
 
 def is_forecasts(path: str | Path) -> bool:
-    """Return whether a file is an npz with a member `forecasts`."""
+    """Return whether a file is an npz with a member `forecasts`.
+
+    Args:
+        path: path of the file.
+    """
     return holds(path, "forecasts")
 
 
@@ -67,7 +71,12 @@ class Forecasts:
                 )
 
     def window(self, n: int, samples: int | None = None) -> Forecasts:
-        """Return the forecasts of window n alone, with its first `samples` futures, or all of them if None."""
+        """Return the forecasts of a single window.
+
+        Args:
+            n: index of the window.
+            samples: number of futures to keep; None for all.
+        """
         row = slice(n, n + 1)
         future = self.forecasts[:samples, row]
         return Forecasts(self.skeleton, self.keys[row], future, self.observed[row], self.truth[row], self.emission)
@@ -96,6 +105,9 @@ class Forecasts:
         Its members are `forecasts`, `observed` and `truth`; `emission` if known; and `split`, `clip` and `start` of
         each window. The skeleton has the fields of its JSON file: `name`, `joint_names`, `parents`, `joints_left`,
         `joints_right`, `up_axis`, `fps`.
+
+        Args:
+            path: path of the file.
         """
         arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
         _write(path, arrays, self.keys, self.skeleton, self.emission)
@@ -103,6 +115,12 @@ class Forecasts:
     @classmethod
     def load(cls, path: str | Path) -> Forecasts:
         """Read a file that `save` wrote.
+
+        Args:
+            path: path of the file.
+
+        Returns:
+            The forecasts.
 
         Raises:
             FileNotFoundError: the file does not exist.
@@ -149,7 +167,11 @@ class Imputed:
         return np.where(self.observed, 0.0, variance**0.5)
 
     def save(self, path: str | Path) -> None:
-        """Write an npz: `filled`, `observed`, `spread`, and the other members of `Forecasts.save`."""
+        """Write an npz: `filled`, `observed`, `spread`, and the other members of `Forecasts.save`.
+
+        Args:
+            path: path of the file.
+        """
         arrays = {"filled": self.filled, "observed": self.observed, "spread": self.spread}
         _write(path, arrays, self.keys, self.skeleton, self.emission)
 

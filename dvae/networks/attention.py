@@ -55,6 +55,11 @@ class Attention:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: `heads` does not divide `width`, or the activation is unknown.
         """
@@ -77,6 +82,11 @@ class SelfAttention(Attention):
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SelfAttentionNetwork:  # type: ignore[override]
         """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: no parent of a local child is read over {1:T}, {<=t} or {>=t}, `heads` does not divide `width`,
@@ -140,19 +150,20 @@ class Layer(nn.Module):
         return stream + update
 
     def absorbed(self, columns: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the weights for `step`, which attends to tokens without computing their keys and values.
+        """Return weights for `step`, which replace the keys and values of the tokens.
 
-        Keys and values are linear in the tokens, so queries can be applied to the tokens and a loop stores only these.
-        A bias of the keys shifts all scores equally and cancels. A bias of the values is added once, since the weights
-        sum to one.
+        Keys and values are linear in the tokens. `step` therefore multiplies queries by the key matrix, and averages of
+        tokens by the value matrix, so a loop stores only the tokens. A bias of the keys shifts all scores of a query
+        equally, and the softmax cancels it. A bias of the values is added once, because attention weights sum to one.
 
         Args:
-            columns: (C, W) matrix that maps tokens as stored, with C numbers, to tokens with W numbers; None if the
-                tokens are stored themselves, C = W.
+            columns: (C, W) matrix from stored tokens with C numbers to tokens with W numbers; None if tokens are stored
+                unchanged, C = W.
 
         Returns:
-            Matrices (heads, W / heads, C) from queries to vectors that are multiplied by stored tokens, matrices
-            (heads, C, W / heads) from averages of stored tokens to values, and a bias (W,) that replaces that of `out`.
+            Three tensors. Matrices (heads, W / heads, C) map queries to vectors, whose products with stored tokens are
+            the scores. Matrices (heads, C, W / heads) map averages of stored tokens to values. A bias (W,) replaces the
+            bias of `out`.
         """
         keys, values = self.keys_values.weight.unflatten(0, (2 * self.heads, -1)).chunk(2)
         if columns is not None:

@@ -79,6 +79,9 @@ class Network(nn.Module):
 
         Returns:
             (B, T, H), or (B, H) for a static child.
+
+        Raises:
+            NotImplementedError: a subclass does not implement the method.
         """
         raise NotImplementedError
 
@@ -89,6 +92,9 @@ class Network(nn.Module):
             parents: {name: values (B, T, D) or (B, D)} of the parents that the loop does not draw.
             batch, length: B and T.
             lengths: as in `forward`.
+
+        Raises:
+            NotImplementedError: a subclass does not implement the method.
         """
         raise NotImplementedError
 
@@ -99,6 +105,9 @@ class Network(nn.Module):
             state: state from `start` or the previous `step`. A loop calls `step` once for each step, in its order.
             t: the step.
             samples: {name: list with the values (B, D) of each step} of the parents that the loop draws.
+
+        Raises:
+            NotImplementedError: a subclass does not implement the method.
         """
         raise NotImplementedError
 
@@ -125,23 +134,45 @@ class Network(nn.Module):
     ) -> tuple[Tensor, Any]:
         """Return the features (B, H) at the last of N steps, and the next state.
 
-        The arguments are those of `forward_chunk`. Networks override the method if they can skip the earlier features.
+        Networks override the method if they can skip the earlier features.
+
+        Args:
+            state: state from `start` or the previous `step`.
+            t: first of the N steps, from 0.
+            count: N, number of steps.
+            samples: {name: list with the values (B, D) of each step} of the parents that the loop draws.
         """
         features, state = self.forward_chunk(state, t, count, samples)
         return features[:, -1], state
 
     def refuse_ragged(self, lengths: Tensor | None) -> None:
-        """Raise a ValueError for a ragged batch; for networks that read the whole sequence at every step."""
+        """Refuse a ragged batch, for networks that read the whole sequence at every step.
+
+        Args:
+            lengths: (B,) number of valid steps of each sequence; None if the batch is not ragged.
+
+        Raises:
+            ValueError: the batch is ragged.
+        """
         if lengths is not None:
             name = type(self).__name__.removesuffix("Network")
             raise ValueError(f"{name} needs sequences of equal length, but this batch is ragged; split it by length")
 
     def select(self, state: Any, rows: Tensor) -> Any:
-        """Return the state for the batch rows with indices (N,), which may repeat; see `loop.select`."""
+        """Return the state for some batch rows, which may repeat.
+
+        Args:
+            state: state from `start` or `step`.
+            rows: indices (N,) of the rows.
+        """
         return select(state, rows)
 
     def chain(self, state: Any) -> Chain | None:
-        """Return the loop from a state of `start` as a `Chain`, or None if `distributions.chain` cannot run it."""
+        """Return the loop from a state of `start` as a `Chain`, or None if `distributions.chain` cannot run it.
+
+        Args:
+            state: result of `start`.
+        """
         return None
 
 
@@ -164,10 +195,13 @@ class FixedLengthNetwork(Network):
 
 
 def presence(name: str) -> str:
-    """Return the name under which a network receives the mask (B, T) of the steps at which a latent exists.
+    """Return the name of a latent's presence mask (B, T) among the inputs of a network.
 
-    The mask is missing if the latent exists at all steps. At steps with False, the latent is integrated out
-    (`Rollout.present`), and the network must not read its values.
+    The mask is True at steps where the latent exists. A latent that exists at all steps has no mask. At the other steps
+    the latent is integrated out (`Rollout.present`), and the network must not read its values.
+
+    Args:
+        name: name of the latent.
     """
     return f"{name} is there"
 

@@ -85,6 +85,11 @@ class CosineEncoder:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineEncoderNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: the child is static, or the parents are not those described above.
         """
@@ -111,6 +116,11 @@ class CosineDecoder(CosineEncoder):
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> CosineDecoderNetwork:  # type: ignore[override]
         """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: the child is static, or the parents are not those described above.

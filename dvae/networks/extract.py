@@ -75,8 +75,8 @@ class Extractors(nn.ModuleDict):
 def share(name: str, *networks: Any) -> None:
     """Share the extractor of a parent among networks.
 
-    The extractor of the first network that has one replaces those of the others. Within `memoizing`, its output is
-    computed once for all networks.
+    All networks use the extractor of the first network that has one. Within `memoizing`, its output is computed once
+    for all networks.
 
     Args:
         name: name of the parent.

@@ -36,8 +36,8 @@ class GraphConv:
 
     Args:
         nodes: {name of a local variable: indices of its nodes}, for the child and all local parents. All nodes have
-            the same number of coordinates. One parent must contain all nodes. Its trajectories are the input, in which
-            the other parents replace the trajectories of their nodes.
+            the same number of coordinates. One parent must contain all nodes. Its trajectories are the input; the other
+            parents replace the trajectories of their nodes in it.
         child: name of the child.
         length: T, number of steps of every sequence.
         coefficients: C, number of cosine coefficients per trajectory, at most T.
@@ -55,9 +55,15 @@ class GraphConv:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> GraphConvNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
-            ValueError: the child is static, a size does not match the number of nodes, no parent contains all nodes, a
-                parent is not read from its first step on at every t, or `coefficients` is not between 1 and `length`.
+            ValueError: the child is static, a size does not match the number of nodes, or no parent contains all nodes.
+                Also if the factor does not read the same first steps of a parent at every t, or `coefficients` is not
+                between 1 and `length`.
         """
         return GraphConvNetwork(self, inputs, local, size)
 

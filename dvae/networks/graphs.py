@@ -41,7 +41,11 @@ class NodeGraph:
     coordinates: int = 1
 
     def build(self, size: int) -> NodeFeatures:
-        """Return the module that maps frames (..., size) to features (..., nodes * width)."""
+        """Return the module that maps frames (..., size) to features (..., nodes * width).
+
+        Args:
+            size: D, dimension of a frame.
+        """
         return NodeFeatures(self, size)
 
 
@@ -114,6 +118,11 @@ class FrameGraph:
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> FrameGraphNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: the child is local, or a parent is not read over {1:T}.

@@ -46,6 +46,11 @@ class WithNoise:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WithNoiseNetwork:
         """Return the network of a factor that reads the scale, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: the factor does not read the scale, reads it at other steps than t, has no other parents, or the
                 scale and the child have different sizes.

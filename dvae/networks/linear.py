@@ -31,7 +31,13 @@ class Linear:
     scale: float = 0.3
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearNetwork:
-        """Return the network of a factor, as in `NetworkSpec.build`."""
+        """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+        """
         return LinearNetwork(self, inputs, local, size)
 
 

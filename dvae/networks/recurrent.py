@@ -64,6 +64,11 @@ class Recurrent:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> RecurrentNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: an option is invalid, the parents do not match `stack` or `mean`, or a parent has a custom mask.
         """
@@ -112,7 +117,7 @@ class Memory(nn.Module):
         return memoize(self, self.key(keys, lengths), lambda: self._states(values, keys, lengths))
 
     def key(self, keys: Mapping[str, Tensor], lengths: Tensor | None) -> list[Tensor | None]:
-        """Return the tensors that determine the states, as the key under which `memoize` stores these."""
+        """Return the tensors that determine the states; `memoize` uses them as the key of the stored states."""
         return [*(keys[parent.name] for parent, _ in self.entries), lengths]
 
     def _states(self, values: Mapping[str, Tensor], keys: Mapping[str, Tensor], lengths: Tensor | None) -> Tensor:
@@ -417,7 +422,7 @@ class RecurrentState:
 
 
 def tie(first: Any, *others: Any) -> None:
-    """Replace the forward memory of other recurrent networks, and its extractors, by those of the first network.
+    """Make other recurrent networks use the forward memory of the first network, including its extractors.
 
     All forward memories must read the same parents at the same lags. Within `loop.memoizing`, their states are computed
     once for all networks.
@@ -491,6 +496,11 @@ class Dense:
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> DenseNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: a parent is read over a range without end, or the activation or a width is invalid.

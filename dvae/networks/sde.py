@@ -67,6 +67,11 @@ class LinearSDE:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearSDENetwork:
         """Return the network of a factor p(z_t | z_{t-1}, d_t), for z of dimension `size`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: the parents differ from z_{t-1} and d_t, or `times` are not positive, finite and in order.
         """
@@ -101,6 +106,11 @@ class LinearSDEGuide:
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> LinearSDEGuideNetwork:
         """Return the network of a factor q(z_t | z_{t-1}, d_t, ...), for z of dimension `size`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: z_{t-1} or the gap is missing among the parents, or `times` are not positive, finite and in

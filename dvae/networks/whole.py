@@ -40,6 +40,11 @@ class WholeEncoder:
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeEncoderNetwork:
         """Return the network of a factor, as in `NetworkSpec.build`.
 
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
+
         Raises:
             ValueError: the child is local, or the factor does not read all steps of a parent.
         """
@@ -65,6 +70,11 @@ class WholeDecoder(WholeEncoder):
     @override
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> WholeDecoderNetwork:  # type: ignore[override]
         """Return the network of a factor, as in `NetworkSpec.build`.
+
+        Args:
+            inputs: the parents of the factor.
+            local: whether the child has a value at every step; otherwise it is static.
+            size: D, dimension of the child.
 
         Raises:
             ValueError: the child is static, a parent is not static, or `sizes` has another dimension for the child.

@@ -315,7 +315,7 @@ class Conditional(nn.Module):
             state: result of `start` or of the previous step.
             t: index of the step, from 0.
             samples: values (B, D) by step of the variables that the loop draws, by name.
-            count: number of steps that are evaluated at once, of which t is the last.
+            count: number of steps that are evaluated at once; t is the last of them.
         """
         if self.network is None:
             return tuple(p[t] for p in state), state

@@ -38,9 +38,12 @@ MAX_SEQUENCES = 2**17
 
 
 class Discrete(int):
-    """The size of a categorical latent that is summed out: its number of states; values are one-hot vectors.
+    """Size of a categorical latent that is summed out, as a number of states; its values are one-hot vectors.
 
     The latent has a factor in the generative model and none in the guide.
+
+    Args:
+        states: number of states K, at least 2.
 
     Raises:
         ValueError: if there are fewer than two states.
@@ -84,7 +87,7 @@ class Window:
 
     @property
     def period(self) -> int:
-        """Period of the state sequences at which the factor is evaluated."""
+        """Period of the state sequences that the factor is evaluated at, in steps."""
         return self.high - self.low + 1
 
 
@@ -146,7 +149,7 @@ class EnumerationPlan:
 
     @cached_property
     def lag(self) -> int:
-        """L, the largest lag at which a factor reads a summed-out latent, in steps."""
+        """L, the largest lag of a factor to a summed-out latent, in steps."""
         return max((window.high for window in self.windows.values()), default=0)
 
     def require_data(self, replaced: Collection[str]) -> None:
@@ -204,7 +207,7 @@ class EnumerationPlan:
         return sequences
 
     def patterns(self, window: Window, length: int) -> dict[str, Tensor]:
-        """Return the n periodic state sequences at which a factor is evaluated, as integers.
+        """Return the n periodic state sequences that a factor is evaluated at, as integers.
 
         The result is a dictionary from latent to (n, T), or (n,) for a static latent.
         """

@@ -2,7 +2,7 @@
 
 The programs have one sample site per variable, whatever the number of steps. A static `w` has the event shape (D,),
 local `z` and `x` have (T, D), all inside the plate "sequences". Free runs, forecasts, reconstructions and scores use
-the same program and differ only in which values are given.
+the same program with different given values.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class DynamicalVAE(nn.Module):
             the programs draw it once for all sequences of the batch. A forecast draws it once for each sample.
         grouped: static latents that the sequences of a group share. A batch gives the groups as "group" (B,); without
             it, every sequence is its own group (`dvae.program.groups`).
-        indicators: data variables for which the guide also reads which entries were observed. Each coordinate has an
+        indicators: data variables whose pattern of missing entries the guide also reads. Each coordinate has an
             indicator of 0 or 1, all 1 without a mask (Collier et al., 2020, arXiv 2006.05301). Without indicators, the
             guide cannot distinguish a missing entry from one observed at 0, or at the mean of a variable with units.
 
@@ -244,6 +244,9 @@ class DynamicalVAE(nn.Module):
             coordinates: units of each coordinate, such as a column of a table; they replace the mean and scale that
                 `fit` would set.
 
+        Returns:
+            Units of the variable; their `fit` sets mean and scale from data.
+
         Raises:
             ValueError: if the variable is unknown.
         """
@@ -353,6 +356,10 @@ class DynamicalVAE(nn.Module):
 
         Returns:
             Dictionary from variable name to value.
+
+        Raises:
+            ValueError: the batch, `draws` or the prefix has an unknown name or a wrong shape, or the length is not
+                known.
         """
         self._register()
         self._check_draws(draws or {})
@@ -418,10 +425,19 @@ class DynamicalVAE(nn.Module):
     def guide(
         self, batch: AnyBatch, *, draws: Mapping[str, int] | None = None, curriculum: float = 1.0, **_: Any
     ) -> dict[str, Tensor]:
-        """Run the inference program q, with the arguments of `model`.
+        """Run the inference program q.
+
+        Args:
+            batch: data, as in `model`; it must include every data variable that the guide reads.
+            draws: dictionary from latent to a number of draws for each sequence, as in `model`.
+            curriculum: progress of the curriculum, from 0 to 1, as in `model`.
+            _: further arguments of `model`, which are ignored.
 
         Returns:
             Dictionary from latent to value.
+
+        Raises:
+            ValueError: the guide reads a variable that the batch does not contain, or the batch or `draws` is invalid.
         """
         self._register()
         self._check_draws(draws or {})
@@ -442,7 +458,15 @@ class DynamicalVAE(nn.Module):
         return values
 
     def forward(self, batch: AnyBatch | None = None, **options: Any) -> dict[str, Tensor]:
-        """Run `model`, which makes the module itself the Pyro model of `elbo(model, model.guide)`."""
+        """Run `model`, which makes the module itself the Pyro model of `elbo(model, model.guide)`.
+
+        Args:
+            batch: batch, as in `model`.
+            options: further arguments of `model`.
+
+        Returns:
+            Dictionary from variable to value, as from `model`.
+        """
         return self.model(batch, **options)
 
     @property
@@ -474,6 +498,9 @@ class DynamicalVAE(nn.Module):
 
         Returns:
             Dictionary from variable name to draws (n, T, D), or (n, D) for a static latent.
+
+        Raises:
+            ValueError: the batch is invalid, or the length is not known.
         """
         with self.running():
             data = self.read(batch, size=n)
@@ -551,7 +578,7 @@ class DynamicalVAE(nn.Module):
             batch: batch with a "mask", as in `model`.
             samples: S, draws of the latents for each sequence.
             draw: draw the missing entries (True) or use their means (False); None uses `is_drawn`.
-            particles: K, number of draws from which each sample is chosen.
+            particles: K, number of candidates for each sample.
             chunk: maximum of sequences times samples in memory, in addition to the result.
 
         Returns:
@@ -590,6 +617,10 @@ class DynamicalVAE(nn.Module):
         """Return log p of every variable given its parents, (B,) each, teacher-forced; their sum is the log joint.
 
         A view that changes volume adds its log-determinant as one entry: the joint is a density of the data as given.
+
+        Args:
+            batch: batch, as in `model`.
+            latents: value of every latent by name, (B, T, D), or (B, D) for a static latent.
 
         Raises:
             ValueError: if a latent is missing or has the wrong shape.
@@ -666,8 +697,8 @@ class DynamicalVAE(nn.Module):
 
         Args:
             values: dictionary from data variable to values (..., B, T, D) in the model's representation.
-            data: the batch that they belong to, as returned by `read`. It contains what the inverse of the view needs,
-                such as a heading; without it, that part of the transformation is not inverted.
+            data: the batch of these values, as returned by `read`. It contains inputs of the inverse, such as headings;
+                without them, this part of the transformation is not inverted.
 
         Returns:
             The values in data space; if the view splits the data into parts, also the whole array.

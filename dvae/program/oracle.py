@@ -54,6 +54,9 @@ def linear_gaussian_surrogate(
         seed: random seed of the weights.
         scale: standard deviation of the weights.
 
+    Raises:
+        ValueError: a text cannot be parsed, or the guide does not fit the model.
+
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
@@ -296,7 +299,14 @@ class Oracle:
         return solved[..., :data], solved[..., data], solved[..., data + 1 :]
 
     def evidence(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """Return log p(x), (B,), of data (B, T, D), or of their observed entries."""
+        """Return log p(x), (B,), of data (B, T, D), or of their observed entries.
+
+        Args:
+            x: data (B, T, D), or a batch with data by name.
+
+        Raises:
+            ValueError: the batch has no value of a data variable, another number of steps, or groups.
+        """
         batch = self.model.read(x)
         run = self._run(batch)
         evidence: Tensor = self._log_joint(run, *self._mixture(run)).logsumexp(1)
@@ -320,6 +330,12 @@ class Oracle:
 
         Latents are stacked in the guide's order. The covariance is (N, N). It is (B, N, N) for a batch with "mask" or
         "lengths", and for a model with discrete latents, whose posterior is a mixture.
+
+        Args:
+            x: data (B, T, D), or a batch with data by name.
+
+        Raises:
+            ValueError: the batch has no value of a data variable, another number of steps, or groups.
         """
         run = self._run(x)
         logs, means, precision = self._mixture(run)
@@ -342,7 +358,14 @@ class Oracle:
         return means[..., :n] + (data[:, None] - means[..., n:]) @ gain.mT, within
 
     def bound(self, x: Tensor | Mapping[str, Tensor]) -> Tensor:
-        """Return the exact ELBO (B,) of the model's guide for data (B, T, D), computed in closed form."""
+        """Return the exact ELBO (B,) of the model's guide for data (B, T, D), computed in closed form.
+
+        Args:
+            x: data (B, T, D), or a batch with data by name.
+
+        Raises:
+            ValueError: same as `evidence`, or a latent is summed out, so the posterior is a mixture.
+        """
         evidence = self.evidence(x)
         if not self.model.latents:
             return evidence
@@ -358,7 +381,11 @@ class Oracle:
         return evidence - self._divergence(distance, precision, root)
 
     def gap(self) -> Tensor:
-        """Return the KL gap: expected evidence minus bound, in nats per sequence, over complete data from the model."""
+        """Return the KL gap: expected evidence minus bound, in nats per sequence, over complete data from the model.
+
+        Raises:
+            ValueError: a latent is summed out, so the posterior is a mixture.
+        """
         gain, offset, root = (part[0] for part in self._guide())
         mean, precision = self._joint()
         n = len(offset)
@@ -380,7 +407,17 @@ class Oracle:
 
     @torch.inference_mode(False)
     def fit_guide(self, iterations: int = 2000) -> float:
-        """Fit the guide to the model's exact KL gap by L-BFGS and return the remaining gap, in nats per sequence."""
+        """Fit the guide to the model's exact KL gap by L-BFGS.
+
+        Args:
+            iterations: maximum number of iterations.
+
+        Returns:
+            The remaining gap, in nats per sequence; 0 for a model without latents.
+
+        Raises:
+            ValueError: a latent is summed out, so the posterior is a mixture.
+        """
         if not self.model.latents:
             return 0.0
         parameters = list(self.model.encoder.parameters())
@@ -422,6 +459,10 @@ def kl_gap(
         generative, inference, sizes, observed: as in `DynamicalVAE`.
         steps: T.
         seeds: number of random models.
+
+    Raises:
+        ValueError: `steps` or `seeds` is less than 1, a text cannot be parsed, the guide does not fit the model, or a
+            latent is `Discrete`.
 
     Example:
         >>> dvae.kl_gap("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, steps=3, seeds=1) > 0
@@ -564,12 +605,16 @@ def edge_costs(
 
     Args:
         generative, inference, observed: as in `DynamicalVAE`.
-        sizes: dimension of every variable; 1 each by default, for which a faithful guide has no cost.
+        sizes: dimension of every variable; 1 each by default; a faithful guide then has no KL gap.
         steps: as in `kl_gap`.
         seeds: as in `kl_gap`.
 
     Returns:
         {edge: (seeds,), increase of the KL gap without the edge in each random model}, largest mean first.
+
+    Raises:
+        ValueError: `steps` or `seeds` is less than 1, a text cannot be parsed, the guide does not fit the model, or a
+            latent is `Discrete`.
 
     Example:
         >>> {edge: bool((cost > 0).all()) for edge, cost in dvae.edge_costs(
@@ -603,6 +648,9 @@ def model_edge_costs(
 
     Returns:
         {edge: (seeds,), loss of evidence without the edge in each random model}, largest mean first.
+
+    Raises:
+        ValueError: `steps` or `seeds` is less than 1, or the text cannot be parsed.
 
     Example:
         >>> {edge: bool((cost > 1e-6).all()) for edge, cost in dvae.model_edge_costs(

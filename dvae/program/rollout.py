@@ -47,6 +47,9 @@ class ScheduledSampling:
             replaced, and so on in turns (Zhou et al., 2018, arXiv 1707.05363, use (5, 5)). With None, any frame may be
             replaced.
 
+    Raises:
+        ValueError: an option is out of range.
+
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | x_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
         >>> own = dvae.ScheduledSampling(0.5)
@@ -68,11 +71,24 @@ class ScheduledSampling:
             raise ValueError(f"blocks must be numbers of kept and of replaced steps, at least 1, got {self.blocks}")
 
     def at(self, level: float) -> ScheduledSampling:
-        """Return a copy with this probability, for schedules."""
+        """Return a copy with this probability, for schedules.
+
+        Args:
+            level: probability, from 0 to 1.
+        """
         return replace(self, probability=level)
 
     def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
-        """Draw a mask (B, T, 1), True at frames that the model's own means replace, for B sequences of T frames."""
+        """Draw a mask (B, T, 1), True at frames that the model's own means replace, for B sequences of T frames.
+
+        Args:
+            batch: B, number of sequences.
+            length: T, number of frames.
+            device: device of the mask.
+
+        Returns:
+            The mask, as booleans.
+        """
         mask = torch.rand(batch, length, 1, device=device) < self.probability
         mask[:, : self.start] = False
         if self.blocks is not None:
@@ -82,7 +98,11 @@ class ScheduledSampling:
         return mask
 
     def fixed_frames(self, length: int) -> list[bool] | None:
-        """Return which of T frames stay unchanged, if this is not random; otherwise None."""
+        """Return whether each of T frames stays unchanged, as T booleans; None if this is random.
+
+        Args:
+            length: T, number of frames.
+        """
         if self.probability < 1:
             return None
         n_kept, n_replaced = self.blocks or (0, 1)
@@ -98,6 +118,9 @@ class InputNoise:
     Args:
         scale: standard deviation, in the unit of the networks' inputs (`dvae.data.units`).
 
+    Raises:
+        ValueError: `scale` is negative or not finite.
+
     Example:
         >>> model = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})
         >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), scheduled_sampling=dvae.InputNoise(0.5))
@@ -110,7 +133,11 @@ class InputNoise:
             raise ValueError(f"the scale of noise must be finite and at least 0, got {self.scale}")
 
     def at(self, level: float) -> InputNoise:
-        """Return a copy with this share of the scale, for schedules."""
+        """Return a copy with this share of the scale, for schedules.
+
+        Args:
+            level: share of the scale.
+        """
         return InputNoise(level * self.scale)
 
 
@@ -155,8 +182,8 @@ class Rollout:
         lengths: (B,) valid steps of a ragged batch.
         observed: dictionary from data variable to (B, T, D), True where an entry was observed. At other entries, the
             model reads its own mean and the guide reads 0.
-        present: dictionary from local latent to (B, T), False at steps at which it is integrated out. Its density does
-            not count there, and networks that read it also read this mask (`networks.base.presence`).
+        present: dictionary from local latent to (B, T), False at steps where it is integrated out. Its density does not
+            count there, and networks that read it also read this mask (`networks.base.presence`).
         prefix: dictionary from variables that the run continues to their first values (B, O, D).
         mean_emission: names of data variables that are set to their means instead of drawn.
         feeding: replacement for the data's history, a `ScheduledSampling` or `InputNoise`; None keeps the history.
@@ -627,7 +654,7 @@ class Sequence(TorchDistribution):
         return entries.sum(-1) if entries.dim() == 3 else entries
 
     def scored(self, value: Tensor) -> Tensor:
-        """Return the value at which densities are evaluated (`Conditional.scored`)."""
+        """Return the value whose density is evaluated (`Conditional.scored`)."""
         return self.rollout.conditionals[self.name].scored(value, self.rollout.mask(self.name))
 
     def expand(self, batch_shape: Any, _instance: object = None) -> Sequence:

@@ -188,7 +188,11 @@ class Ablation(Result):
 
     @styled
     def plot(self) -> Figure:
-        """Draw model and guide of one step, with edges as wide as their cost, on surrogates and, if fitted, on data."""
+        """Draw model and guide of one step, with edges as wide as their cost, on surrogates and, if fitted, on data.
+
+        Returns:
+            A matplotlib figure.
+        """
         parts = [part for part in (self.generative, self.inference) if part.factors]
         on_surrogates = {run: float(np.mean(costs)) for run, costs in self.costs.items()}
         rows: list[tuple[str, dict[str, float], set[str]]] = [("nats a sequence, on surrogates", on_surrogates, set())]
@@ -255,7 +259,7 @@ def edge_of(part: Factorization, child: str, parent: Parent) -> AblatedEdge:
 
 
 def as_equations(method: Method | tuple[str, str], schema: Schema | None = None) -> Equations:
-    """Return a method as `Equations`, with networks of one kind and those of its options that `Equations` has.
+    """Return a method as `Equations`, with networks of one kind and all options that `Equations` also has.
 
     Args:
         method: one of `FAMILY`, `equations`, or a pair of equations (generative, inference).
@@ -327,6 +331,9 @@ def ablate(
         bound_particles: number of particles of the IWAE bound.
         seed: seed of the draws of the IWAE bound.
         progress: whether to show a progress bar.
+
+    Returns:
+        Costs of each edge in nats per sequence on the surrogates and, with data, in nats per frame.
 
     Raises:
         ValueError: the method is not defined by its equations alone; data without `out`; the guide does not draw a

@@ -185,6 +185,9 @@ def load(path: str | os.PathLike[str], data: str | os.PathLike[str] | None = Non
         path: run directory, as `dvae fit` writes it.
         data: current path of the data, if the path in the run is no longer valid.
 
+    Returns:
+        The run: `model` in evaluation mode, `method`, `schema` and `data`.
+
     Raises:
         CheckpointError: the run is missing or damaged.
 

@@ -20,7 +20,7 @@ def ahead(panel: Panel, schema: PanelSchema, horizon: int | None = None) -> Pane
     Args:
         panel: the sequences.
         schema: schema of the run.
-        horizon: steps of the future; by default those of the schema.
+        horizon: steps of the future; the horizon of the schema by default.
 
     Raises:
         ValueError: if sequences are not cut into windows, or none is long enough and has the covariates of its future.

@@ -96,6 +96,9 @@ class ColumnHints:
     def of(self, frame: Any) -> Columns:
         """Return the schema of a frame; entries that are not given are inferred, as in `infer_columns`.
 
+        Args:
+            frame: pandas frame in the long form.
+
         Raises:
             ValueError: if columns do not exist, families are unknown, or cells are ambiguous.
         """
@@ -189,6 +192,9 @@ def infer_columns(frame: Any) -> Columns:
 
     Args:
         frame: table.
+
+    Returns:
+        The schema.
 
     Raises:
         ValueError: if no column can be a target, cells are ambiguous, or the table is not in the long form.

@@ -152,7 +152,11 @@ class Columns:
                 raise ValueError(f"zone is {self.zone!r}, but no column is the time; name the column")
 
     def of(self, *roles: Role) -> list[Column]:
-        """Return the columns with one of these roles."""
+        """Return the columns with one of these roles.
+
+        Args:
+            roles: roles: "target", "known", "past" or "static".
+        """
         return [column for column in self.columns if column.role in roles]
 
     @property
@@ -195,6 +199,9 @@ class Columns:
     def without(self, *names: str) -> Self:
         """Return the schema without some columns.
 
+        Args:
+            names: names of the columns to leave out.
+
         Raises:
             ValueError: if a column does not exist or no target remains.
         """
@@ -224,6 +231,9 @@ class Columns:
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Return the schema from `config` or a TOML file; columns are real targets by default.
+
+        Args:
+            config: dictionary of the fields, with columns by name.
 
         Raises:
             ValueError: if an entry is unknown; the message names the nearest known one.
@@ -260,6 +270,9 @@ class Columns:
     @classmethod
     def from_toml(cls, text: str) -> Self:
         """Return the schema of a TOML file.
+
+        Args:
+            text: content of the file.
 
         Raises:
             ValueError: if the text is not TOML or an entry is unknown.

@@ -70,6 +70,9 @@ class PanelData:
             cut: how to split and cut sequences; by default from the schema file, or else `default_cut`.
             **options: further fields of `ColumnHints` and of `Cut`.
 
+        Returns:
+            The panel, with its schema and splits.
+
         Raises:
             FileNotFoundError: if the file does not exist.
             TypeError: if `cut` is not a `Cut`.
@@ -88,17 +91,42 @@ class PanelData:
 
     @classmethod
     def of(cls, data: Any, columns: Any = None, cut: Cut | None = None, name: str = "panel") -> Self:
-        """Wrap data in memory, as in `Panel.of`; a run fitted to them cannot reopen them by a path."""
+        """Wrap data in memory, as in `Panel.of`; a run fitted to them cannot reopen them by a path.
+
+        Args:
+            data: a pandas frame, arrays, an xarray `Dataset` or a `Panel`.
+            columns: a schema, or targets as in `ColumnHints`.
+            cut: how to split and cut sequences; `default_cut` of the panel if None.
+            name: name for titles.
+
+        Returns:
+            The panel, with its schema and splits.
+
+        Raises:
+            TypeError: the data have another type, or `cut` is not a `Cut`.
+            ValueError: the data have no such columns, or values are invalid.
+        """
         require(Cut | None, cut=cut)
         panel = Panel.of(data, columns, name)
         return cls(name, panel, PanelSchema.from_data(panel, cut or default_cut(panel)))
 
     def with_data(self, data: Any) -> Self:
-        """Return other data, of any type that `Panel.of` accepts, with the columns, cut and units of this schema."""
+        """Return other data, of any type that `Panel.of` accepts, with the columns, cut and units of this schema.
+
+        Args:
+            data: data with these columns.
+
+        Raises:
+            TypeError: the data have another type.
+            ValueError: the data have no such columns, or values are invalid.
+        """
         return replace(self, panel=Panel.of(data, self.panel.columns, self.panel.name))
 
     def only(self, sequences: Iterable[str]) -> Self:
         """Return some of the sequences, by name.
+
+        Args:
+            sequences: names of the sequences to keep.
 
         Raises:
             ValueError: if a sequence does not exist.
@@ -114,11 +142,22 @@ class PanelData:
         return replace(self, schema=replace(self.schema, cut=replace(self.schema.cut, **cut)))
 
     def windows(self, split: str) -> PanelWindows:
-        """Return the windows of "train", "validation", "test" or "train+validation"; "all" ignores the split."""
+        """Return the windows of "train", "validation", "test" or "train+validation"; "all" ignores the split.
+
+        Args:
+            split: "train", "validation", "test", "train+validation" or "all".
+
+        Raises:
+            ValueError: the split has no window.
+        """
         return PanelWindows(self.panel, self.schema, split)
 
     def parts(self) -> dict[str, str]:
-        """Describe the windows of each split and the omitted ones, or state why a split is empty."""
+        """Describe the windows of each split and the omitted ones, or state why a split is empty.
+
+        Returns:
+            Text by name of the split.
+        """
         descriptions = {}
         for split in SPLITS:
             try:
@@ -134,7 +173,7 @@ class PanelData:
         """Return one window for each sequence; its future follows the last target, as in `dvae.tables.ahead`.
 
         Args:
-            horizon: steps of the future; by default those of the schema.
+            horizon: steps of the future; the horizon of the schema by default.
 
         Raises:
             ValueError: if sequences are not cut into windows, are too short, or have no covariates of the future.
@@ -169,6 +208,14 @@ class PanelData:
         """Read a recorded panel with the schema of the run, from its path or another one.
 
         The content may have changed.
+
+        Args:
+            source: result of `recorded`.
+            schema: schema of the run.
+            path: current path, if the data have moved.
+
+        Returns:
+            The panel, with the schema of the run.
 
         Raises:
             FileNotFoundError, ValueError: as in `open`.

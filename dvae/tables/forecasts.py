@@ -71,6 +71,9 @@ class PanelForecasts:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as CSV or Parquet, or all arrays as npz, by the extension of the path.
 
+        Args:
+            path: path that ends in .csv, .parquet or .npz.
+
         Raises:
             ValueError: if the extension is unknown, or pyarrow is missing for Parquet.
         """
@@ -86,6 +89,9 @@ class PanelForecasts:
             window: index of the window.
             columns: names of the coordinates; by default the first ones.
             most: maximum number of panels.
+
+        Returns:
+            A matplotlib figure.
 
         Raises:
             ValueError: if a coordinate does not exist.
@@ -114,7 +120,13 @@ class PanelForecasts:
         return figure
 
     def fan(self, axis: Axes, window: int, column: str) -> None:
-        """Plot one coordinate of a window on given axes, as `plot` does."""
+        """Plot one coordinate of a window on given axes, as `plot` does.
+
+        Args:
+            axis: matplotlib axes to draw on.
+            window: index of the window.
+            column: name of the coordinate.
+        """
         index = list(self.columns).index(column)
         observed, horizon = self.past.shape[1], self.draws.shape[2]
         steps: Any = np.arange(observed + horizon) if self.times is None else self.times[window]
@@ -175,6 +187,9 @@ class PanelImputed:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as CSV or Parquet, or all arrays as npz, by the extension of the path.
+
+        Args:
+            path: path that ends in .csv, .parquet or .npz.
 
         Raises:
             ValueError: if the extension is unknown, or pyarrow is missing for Parquet.
@@ -253,6 +268,9 @@ def panel_scores(windows: HeldOutWindows) -> list[Measure]:
     """Return proper scores and calibration, and, for a few columns, the CRPS of each column in its unit.
 
     The command line prints these scores: `dvae.evaluate(model, windows, scores=dvae.tables.panel_scores)`.
+
+    Args:
+        windows: windows of a panel.
     """
     columns = columns_of(windows)
     measures = [*calibrated(windows), *(by_column(CRPS, columns) if 1 < len(columns) <= FEW else [])]

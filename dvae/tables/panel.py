@@ -68,7 +68,13 @@ class Series:
         return len(self.values)
 
     def moments(self, start: int, steps: int, calendar: Calendar) -> np.ndarray | None:
-        """Return the times of `steps` steps from `start` on, continued after the end by `Calendar.after`."""
+        """Return the times of `steps` steps from `start` on, continued after the end by `Calendar.after`.
+
+        Args:
+            start: first step, from 0.
+            steps: number of steps.
+            calendar: calendar of the panel.
+        """
         if self.times is None:
             return None
         times = self.times[start : start + steps]
@@ -184,7 +190,11 @@ class Panel:
         return any(bool(np.isnan(block[:, self._targets]).any()) for block in row_blocks(incomplete))
 
     def present(self, one: Series) -> int:
-        """Return the number of steps up to the last one with a target; later rows belong to the future."""
+        """Return the number of steps up to the last one with a target; later rows belong to the future.
+
+        Args:
+            one: a sequence of this panel.
+        """
         if one.name in self.complete:
             return len(one)
         for rows in reversed([*ranges(one.values)]):
@@ -200,6 +210,9 @@ class Panel:
 
     def only(self, names: Iterable[str]) -> Panel:
         """Return some of the sequences.
+
+        Args:
+            names: names of the sequences to keep.
 
         Raises:
             ValueError: if a sequence does not exist.
@@ -219,6 +232,9 @@ class Panel:
             columns: a schema, or targets as in `ColumnHints`, with the rest inferred. For arrays, a schema, or names of
                 real targets; by default x0, x1, …
             name: name for titles.
+
+        Returns:
+            The panel; a given panel is returned unchanged.
 
         Raises:
             TypeError: if the data have another type.
@@ -281,6 +297,12 @@ class Panel:
             column: description of the variable; by default a real target named "value".
             name: name for titles.
             zone: time zone of dates in the index, as in `Columns`.
+
+        Returns:
+            The panel, with one sequence per column that has a value.
+
+        Raises:
+            ValueError: times are not unique, or a cell is not a number.
         """
         index, moments, calendar = data.index.to_series(name=data.index.name or "index"), None, Calendar()
         if is_number(index) or is_date(index) or is_duration(index):

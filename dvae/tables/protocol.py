@@ -75,6 +75,14 @@ class Cut:
         With a split by time, a window belongs to the split of its future; its observed steps may lie earlier. "all"
         includes all sequences regardless of their split. "last" is the end of each sequence, including rows without
         targets.
+
+        Args:
+            panel: the sequences.
+            split: "train", "validation" or "test", several joined by "+", or "all" or "last".
+
+        Raises:
+            ValueError: only some sequences state their split, groups are missing, or there are too few sequences to
+                split.
         """
         windows = []
         for index, low, high in self.spans(panel, split):
@@ -85,7 +93,16 @@ class Cut:
         return windows
 
     def spans(self, panel: Panel, split: str) -> list[tuple[int, int, int]]:
-        """Return (sequence, first step, end) of the steps of a split, even if they are too short for a window."""
+        """Return (sequence, first step, end) of the steps of a split, even if they are too short for a window.
+
+        Args:
+            panel: the sequences.
+            split: "train", "validation" or "test", several joined by "+", or "all" or "last".
+
+        Raises:
+            ValueError: only some sequences state their split, groups are missing, or there are too few sequences to
+                split.
+        """
         spans = []
         everywhere = split in ("all", "last")
         parts = None if self.split == "time" or everywhere else self._parts(panel)

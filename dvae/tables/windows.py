@@ -194,6 +194,13 @@ class PanelWindows:
         """Draw windows with replacement, with equal probability of each start; whole sequences without replacement.
 
         In a panel with groups, a batch has few groups, with several windows each.
+
+        Args:
+            batch_size: B, number of windows.
+            generator: random generator on the CPU.
+
+        Returns:
+            A batch with "x" (B, T, D), and masks, lengths and covariates if any.
         """
         if self.schema.columns.group:
             return self._cut(*self._sample_groups(batch_size, generator))
@@ -220,7 +227,11 @@ class PanelWindows:
         return indices, low + (u_start * (last - low + 1)).long()
 
     def some(self, places: Sequence[int]) -> Self:
-        """Return some of the listed windows."""
+        """Return some of the listed windows.
+
+        Args:
+            places: indices of the windows to keep.
+        """
         subset = copy(self)
         ranges, starts = self._windows
         subset._windows = ranges[list(places)], starts[list(places)]
@@ -234,6 +245,9 @@ class PanelWindows:
         """Return an iterator over batches of the listed windows.
 
         If sequences are whole or have groups, all windows are loaded into memory first.
+
+        Args:
+            batch_size: largest number of windows in a batch.
         """
         if self.length is None or self.schema.columns.group:
             return Sequences(self.all()).batches(batch_size)
@@ -247,6 +261,9 @@ class PanelWindows:
             model: model fitted to the same schema.
             samples: K, draws of each window.
             seed: random seed of the draws.
+
+        Returns:
+            Draws (K, N, H, D), with the past, the truth and times.
 
         Raises:
             ValueError: if the windows are whole sequences, which have no future.
@@ -280,6 +297,9 @@ class PanelWindows:
             seed: random seed of the draws.
             particles: candidates for each draw, weighted by the observed entries, as in `DynamicalVAE.impute`.
 
+        Returns:
+            Draws (K, N, T, D), with the positions of missing values and times.
+
         Raises:
             ValueError: if no values are missing.
         """
@@ -304,6 +324,9 @@ class PanelWindows:
         """Return times (N, steps) from the start of each listed window, None without times, and their calendar.
 
         After the end of a sequence they continue as `Calendar.after` describes.
+
+        Args:
+            steps: number of steps.
         """
         calendar = self.panel.calendar
         indices, starts = map(Tensor.tolist, self._windows)

@@ -66,6 +66,9 @@ class FactorizationContract:
 
         Args:
             size: dimension D of the data and, where free, of the other variables.
+
+        Raises:
+            NotImplementedError: a subclass does not implement the method.
         """
         raise NotImplementedError("subclass FactorizationContract and implement build(self, size) to return the model")
 
@@ -117,7 +120,7 @@ class FactorizationContract:
         self._close(draw_logs, _run(poutine.condition(model.guide, data=latents), data)[1])
 
     def test_the_log_joint_is_that_of_the_per_step_program(self) -> None:
-        """Log densities of the program equal those of a loop over time with one site per variable and step."""
+        """The program and a loop over time with one site per variable and step give equal log densities."""
         model = self._model()
         data = self._data(model)
         latents, _ = _run(model.guide, data)

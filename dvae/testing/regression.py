@@ -318,7 +318,7 @@ def measure(
     Args:
         model, guide, data, bound: as in `ElboRegression.check`.
         particles: number K of draws.
-        seed: seed from which each draw gets its own seed, independent of the other draws.
+        seed: seed of all draws; each draw has its own seed, derived from this one.
 
     Raises:
         ValueError: bounds are not finite, or not one for each sequence.

@@ -191,8 +191,8 @@ class _Annealing:
 
         Args:
             step_sizes: step sizes (B,) by index of the temperature, from `step_sizes`.
-            start: exact latents (B, ...) by name, from which chains run back to the guide; None for chains that start
-                at draws from the guide.
+            start: exact latents (B, ...) by name, where reverse chains to the guide start; None for forward chains,
+                which start at draws from the guide.
         """
         back = start is not None
         points = self._flattened(self.model.guide(self.data) if start is None else repeat(start, self.chains))

@@ -110,6 +110,9 @@ class SequenceELBO(ELBO):
             guide: guide; the model's own by default.
             options: options of the program, such as `scheduled_sampling`.
 
+        Returns:
+            Terms in nats, (B,) each.
+
         Raises:
             ValueError: when a site is scaled, or missing in guide or model.
         """
@@ -118,17 +121,32 @@ class SequenceELBO(ELBO):
         return draws[0] if len(draws) == 1 else _mean(draws)
 
     def differentiable_loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> Tensor:
-        """Return the energies minus the bound, summed over the batch."""
+        """Return the energies minus the bound, summed over the batch.
+
+        Args:
+            model, guide: Pyro programs, such as a `DynamicalVAE` and its `guide`.
+            args, kwargs: arguments of both programs, such as a batch.
+        """
         draws = [self._terms(model, guide, args, kwargs) for _ in range(self.num_particles)]
         return sum(sum(t.energies.values()) - t.bound for t in draws).sum() / self.num_particles  # type: ignore[return-value, union-attr]
 
     def loss(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
-        """Return `differentiable_loss` as a number."""
+        """Return the energies minus the bound, summed over the batch, as a number.
+
+        Args:
+            model, guide: Pyro programs, such as a `DynamicalVAE` and its `guide`.
+            args, kwargs: arguments of both programs, such as a batch.
+        """
         with torch.no_grad():
             return self.differentiable_loss(model, guide, *args, **kwargs).item()
 
     def loss_and_grads(self, model: Any, guide: Any, *args: Any, **kwargs: Any) -> float:
-        """Return `differentiable_loss` as a number, and add its gradient to the parameters."""
+        """Return the energies minus the bound as a number, and add the gradient of this loss to the parameters.
+
+        Args:
+            model, guide: Pyro programs, such as a `DynamicalVAE` and its `guide`.
+            args, kwargs: arguments of both programs, such as a batch.
+        """
         loss = self.differentiable_loss(model, guide, *args, **kwargs)
         loss.backward()
         return loss.item()
@@ -365,6 +383,9 @@ def iwae_bound(
 
     Returns:
         Bound and tail shape, (B,) each.
+
+    Raises:
+        ValueError: `particles` is less than 1, or the model has no likelihood.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})

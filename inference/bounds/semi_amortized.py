@@ -95,7 +95,7 @@ class Correction:
         unit: standard deviations (B, S, D) of the guide before the correction.
         shift: shift (B, S, D) of the location, in units.
         stretch: shift (B, S, D) of the logarithm of the scale.
-        links: linear terms by which the location depends on draws of other latents, one for each latent.
+        links: linear functions of draws of other latents, one for each latent, which are added to the location.
     """
 
     unit: Tensor
@@ -159,7 +159,15 @@ class CorrectedConditional(nn.Module):
         return super().__getattr__(name) if name == "conditional" else getattr(self.conditional, name)
 
     def forward(self, parents: Mapping[str, Tensor], *arguments: Any) -> Parameters:
-        """Return the corrected parameters; same arguments as in `Conditional`."""
+        """Return the corrected parameters at all steps, (B, T, D), or (B, D) for a static latent.
+
+        Args:
+            parents: values of the parents by name, (B, T, D) or (B, D), of the guide and of the links.
+            arguments: batch size B, number of steps T, valid steps (B,) and groups of `Conditional.forward`.
+
+        Raises:
+            ValueError: the batch has other sequences than those that the correction was fitted to.
+        """
         values = {link.parent: _by_step(parents[link.parent]) for link in self.correction.links}
         parameters = self.conditional(parents, *arguments)
         if self.factor.local:
@@ -179,7 +187,17 @@ class CorrectedConditional(nn.Module):
     def step(
         self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]], count: int = 1
     ) -> tuple[Parameters, Any]:
-        """Return the corrected parameters; same arguments as in `Conditional`."""
+        """Return the corrected parameters (B, D) at step t, and the next state of a loop over time.
+
+        Args:
+            state: result of `start` or of the previous step.
+            t: index of the step, from 0.
+            samples: values (B, D) by step of the variables that the loop draws, by name.
+            count: number of steps that are evaluated at once; t is the last of them.
+
+        Raises:
+            ValueError: the batch has other sequences than those that the correction was fitted to.
+        """
         fixed, inner, values, steps = state
         if fixed is None:
             parameters, inner = self.conditional.step(inner, t, samples, count)

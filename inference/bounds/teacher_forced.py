@@ -89,7 +89,19 @@ def filtered(
     particles: int,
     parts: Iterable[slice],
 ) -> dict[str, np.ndarray]:
-    """Return the FIVO bound by its name, in nats per sequence (N,); arguments and errors as in `bounds`."""
+    """Return the FIVO bound of each sequence, {"FIVO bound": (N,)}, in nats.
+
+    Args:
+        name: name of the model, for errors.
+        model: model with its guide.
+        batch: batch of all N sequences.
+        keys: (split, clip, first frame) of each sequence, for errors.
+        particles: K, number of particles.
+        parts: slices of the sequences, evaluated one after another.
+
+    Raises:
+        FloatingPointError: when a bound is not finite.
+    """
     values = []
     for part in parts:
         bound = fivo_bound(model, on_device_of(model, batch.rows(part)), particles).bound

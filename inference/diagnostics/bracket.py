@@ -116,6 +116,9 @@ class Bracket(Result):
             data: "real", with errors clustered by clip, or "simulated".
             frame: whether to return nats per frame instead of per sequence.
 
+        Returns:
+            Mean with its standard error, in nats.
+
         Raises:
             KeyError: when the bound does not exist for these data.
         """
@@ -128,10 +131,14 @@ class Bracket(Result):
         return TwoWayErrors.by_clip(values[None], weights, clips).estimate()
 
     def gap(self, data: str = "real", *, frame: bool = False) -> dict[str, Estimate]:
-        """Return the parts of the gap between ELBO and evidence; see the module.
+        """Return the parts of the gap between ELBO and evidence by name, in nats per sequence.
 
         "family" is a lower limit, because it ends at the lower bound on the evidence. "unknown", for simulated data, is
         the distance from this bound to the upper one: the family part may be larger by this amount.
+
+        Args:
+            data: "real" or "simulated".
+            frame: whether to return nats per frame instead of per sequence.
         """
         bounds = self.bounds[data]
         parts = {name: ends for name, ends in PARTS.items() if all(end in bounds for end in ends)}
@@ -179,7 +186,11 @@ class Bracket(Result):
 
     @styled
     def plot(self) -> Figure:
-        """Draw all bounds above the ELBO for real and simulated data, the parts of the gap, and the bracket shaded."""
+        """Draw all bounds above the ELBO for real and simulated data, the parts of the gap, and the bracket shaded.
+
+        Returns:
+            A matplotlib figure.
+        """
         figure = new_figure(7, 5.4)
         panels = figure.subplots(2, 1)  # separate axes, because a guide may be far worse on simulated data
         unknown = self.estimate("upper", "AIS", "simulated").mean
@@ -276,6 +287,10 @@ def bracket(
         seed: seed of all draws.
         batch_size: number of sequences in a batch.
         progress: whether to show a progress bar.
+
+    Returns:
+        Each bound by name, (N,) in nats per sequence, for "real" and for "simulated" data; only the simulated data have
+        the upper bound.
 
     Raises:
         ValueError: when the model has no latents or likelihood, the batch has groups that share latents, or a number is

@@ -87,7 +87,10 @@ class Calibration(Result):
 
     @property
     def bias(self) -> np.ndarray:
-        """Mean of the truth minus the guide's mean, in the guide's standard deviations, (Q,); see `spread`."""
+        """Mean of the truth minus the guide's mean, in standard deviations of the guide, (Q,).
+
+        It is estimated by maximum likelihood from the ranks, like `spread`.
+        """
         return self._normals[:, 0]
 
     @property
@@ -244,6 +247,9 @@ def calibrate(
         seed: seed of simulations and draws.
         chunk: largest number of sequences times draws in memory.
         progress: whether to show a progress bar.
+
+    Returns:
+        Ranks (N, Q) of the simulated latents among the L draws of the guide, from 0 to L.
 
     Raises:
         ValueError: when a number is below 1, steps are beyond the length, context is missing, or the guide has no site

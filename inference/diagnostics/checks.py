@@ -351,6 +351,9 @@ def predictive_checks(
         batch_size: number of windows in a batch.
         progress: whether to show a progress bar.
 
+    Returns:
+        Statistics of real and replicated windows, by model, program and statistic.
+
     Raises:
         ValueError: when windows are ragged, there are too few samples, or a statistic has the wrong shape or is not
             finite on real windows.

@@ -48,6 +48,9 @@ class Descent:
         renewed: number of steps between calls of `renew`.
         newton: number of Newton steps at the end, each with its own curvature.
 
+    Raises:
+        ValueError: an option is out of range, or there are more starts than candidates.
+
     Example:
         >>> quick = dvae.Descent(steps=50, starts=2)
     """
@@ -76,8 +79,8 @@ class Posterior:
         course: energies during the search from the start that reached the lowest, (steps, B).
         left: reduction of the energy that another Newton step would give for a quadratic energy, in nats, (B,); about 0
             after convergence.
-        bent: number of directions in which the energy has less curvature than the prior's, (B,). There the normal is as
-            wide as the prior, because otherwise it would be wider or have no finite width.
+        bent: number of directions with less curvature of the energy than the prior has, (B,). In these directions, the
+            normal is as wide as the prior; otherwise it would be wider or have no finite width.
         factor: lower triangular factor of the covariance of all latent numbers of a sequence, in the order of `mode`,
             (B, P, P).
 
@@ -112,11 +115,23 @@ class Posterior:
         return split(self.factor.norm(dim=-1), self.mode)
 
     def draw(self, n: int, seed: int = 0) -> dict[str, Tensor]:
-        """Return draws (n, B, ...) of each latent from the normal."""
+        """Return draws (n, B, ...) of each latent from the normal.
+
+        Args:
+            n: number of draws for each sequence.
+            seed: seed of the draws.
+        """
         return split(joined(self.mode) + self._deviations(n, torch.Generator().manual_seed(seed)), self.mode)
 
     def guide(self, batch: Any = None) -> dict[str, Tensor]:
-        """Sample from the normal as a Pyro guide of the program, on the same batch."""
+        """Sample from the normal as a Pyro guide of the program, on the same batch.
+
+        Args:
+            batch: ignored; draws are for the batch of this posterior.
+
+        Returns:
+            Dictionary from latent to one draw (B, ...).
+        """
         with pyro.plate("sequences", len(self.factor)):
             distribution = dist.MultivariateNormal(joined(self.mode), scale_tril=self.factor)
             flat = pyro.sample("_latents", distribution, infer={"is_auxiliary": True})
@@ -136,6 +151,12 @@ class Posterior:
             particles: K, number of particles.
             seed: seed of the draws.
             chunk: largest number of sequences times particles in memory.
+
+        Returns:
+            Log evidence and k-hat, (B,) each.
+
+        Raises:
+            ValueError: a site of the program has no separate log-density for each sequence.
         """
         generator = torch.Generator().manual_seed(seed)
         distribution = dist.MultivariateNormal(torch.zeros_like(self.factor[..., 0]), scale_tril=self.factor)
@@ -179,6 +200,9 @@ def posterior(
         seed: seed of the candidates.
         chunk: largest number of sequences times starts in memory.
         progress: whether to show a progress bar.
+
+    Returns:
+        Modes (B, ...) of the latents, their energies (B,) in nats, and the normal approximations at the modes.
 
     Raises:
         ValueError: when the program has no latents, a site has no separate log-density for each sequence, or the prior

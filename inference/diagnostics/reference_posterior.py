@@ -381,6 +381,9 @@ def reference_posterior(
         seed: seed of all draws.
         progress: whether to show a progress bar.
 
+    Returns:
+        Moments of each latent value under the guide and under the posterior, and the convergence of sampling.
+
     Raises:
         ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or cannot take every
             real value. Also when a sequence is not in the batch, data are missing, or a number is too small.

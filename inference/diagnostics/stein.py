@@ -148,6 +148,9 @@ def stein_discrepancy(
         seed: seed of all draws.
         progress: whether to show a progress bar.
 
+    Returns:
+        Squared discrepancy, critical value and p-value of each of S sequences, (S,) each, and a joint p-value.
+
     Raises:
         ValueError: when the model has no latents or likelihood, or a latent is shared by sequences or cannot take every
             real value. Also when a sequence is not in the batch, data are missing, or a number is too small.

@@ -74,6 +74,9 @@ def traverse(
         draws: number of draws for the standard deviation.
         seed: seed of all draws.
 
+    Returns:
+        Decoded x (C, M, B, T, D) for C coordinates and M offsets, with offsets (M,) and their units (C,).
+
     Raises:
         ValueError: when a latent or coordinate is unknown, offsets do not include 0, or the latent does not affect x.
 

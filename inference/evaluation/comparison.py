@@ -164,9 +164,10 @@ class Comparison(Result):
         return parts[0].estimate(parts[1])
 
     def pairs(self, metric: str = "IWAE bound") -> Pairs:
-        """Return all paired differences in a metric, with p-values adjusted for their number.
+        """Return all paired differences in a metric, with p-values adjusted for their number by Holm's method.
 
-        `multiple_comparisons.pairs` describes the adjustment.
+        Args:
+            metric: name of a score, such as "IWAE bound".
 
         Raises:
             KeyError: when a model has no such metric.
@@ -193,7 +194,10 @@ class Comparison(Result):
     def required(self, first: str, second: str, metric: str = "IWAE bound", **options: Any) -> Requirement:
         """Return how many training seeds and clips would distinguish two models.
 
-        `multiple_comparisons.required` has the same options.
+        Args:
+            first, second: names of two models with at least two seeds each.
+            metric: name of a score.
+            options: difference to detect, power, level and seeds, as in `multiple_comparisons.required`.
 
         Raises:
             KeyError: as `difference`.
@@ -206,6 +210,9 @@ class Comparison(Result):
 
     def join(self, other: Comparison) -> Comparison:
         """Return a comparison with the rows of this and another comparison of the same sequences and settings.
+
+        Args:
+            other: comparison of other models on the same sequences.
 
         Raises:
             ValueError: when sequences or settings differ, or both have a model of the same name.
@@ -226,7 +233,11 @@ class Comparison(Result):
 
     @styled
     def plot(self) -> Figure:
-        """Draw bounds, paired differences to the best, k-hat, and the KL of every local latent over time."""
+        """Draw bounds, paired differences to the best, k-hat, and the KL of every local latent over time.
+
+        Returns:
+            A matplotlib figure.
+        """
         ranking = self.ranking
         colours = {name: f"C{place % 10}" for place, name in enumerate(self.rows)}
         latents = list(dict.fromkeys(latent for row in self.rows.values() for latent in row.kl_steps))

@@ -111,6 +111,9 @@ class PredictionBands(Result):
 
         Before recalibration, the band is m ± q v, with q the quantile of the distances of each forecast from the
         others. Clips have equal weight in the scores, as in the calibration.
+
+        Args:
+            windows: windows to evaluate.
         """
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
@@ -205,7 +208,11 @@ class PredictionBands(Result):
 
     @styled
     def plot(self) -> Figure:
-        """Draw factors over the horizon, for single numbers as mean and range over coordinates."""
+        """Draw factors over the horizon, for single numbers as mean and range over coordinates.
+
+        Returns:
+            A matplotlib figure.
+        """
         figure = new_figure(4.5, 3)
         axes = figure.subplots()
         numbers = self.factors["number"]
@@ -273,6 +280,10 @@ def conformal_bands(
         batch_size: number of windows in a batch.
         options: further arguments of the model's `forecast`.
         progress: whether to show a progress bar.
+
+    Returns:
+        Factors on the spread of forecasts by region, and the spread (H, D) if `residuals` is given;
+        `PredictionBands.scores` evaluates the coverage on other windows.
 
     Raises:
         ValueError: when the level is invalid or needs more clips, forecasts have no spread, or `groups` and windows
@@ -353,7 +364,7 @@ def conformal_bands(
 def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
     """Return values by clip whose mean, weighted by numbers of windows, is the plain mean over clips.
 
-    The standard error is also that of the plain mean.
+    The standard error also equals the standard error of the plain mean.
 
     Args:
         values: score of every window, `(N,)`.

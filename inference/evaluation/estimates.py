@@ -201,7 +201,15 @@ class TwoWayErrors:
         return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / totals, totals)
 
     def estimate(self, other: TwoWayErrors | None = None) -> Estimate:
-        """Return the mean, or its paired difference to another model's mean; errors as in the module docstring."""
+        """Return the weighted mean over seeds and clips, or its paired difference to another model's mean.
+
+        The error over sequences is clustered by clip. The error over seeds uses the variance of the seeds' means. The
+        total is V_sequences + V_seeds - V_rest, but at least the larger of the first two variances. With one seed, the
+        error over seeds and the total are NaN; with one clip, the error over sequences and the total are NaN.
+
+        Args:
+            other: statistics of the model to subtract, on the same sequences; None for the mean itself.
+        """
         mean, deviations, between, rest = self.mean, self.deviations, self.seeds, self.rest
         of_seeds = [(self.seeds, self.count - 1)]
         if other is not None:

@@ -193,7 +193,14 @@ class Evaluation(Result):
 
     @styled
     def plot(self, metrics: Sequence[str] | None = None) -> Figure:
-        """Draw one panel per metric, with a dot and a bar of one standard error per method."""
+        """Draw one panel per metric, with a dot and a bar of one standard error per method.
+
+        Args:
+            metrics: names of the metrics to draw; all by default.
+
+        Returns:
+            A matplotlib figure.
+        """
         names = list(self.metrics if metrics is None else metrics)
         columns = min(3, len(names))
         rows = math.ceil(len(names) / columns)
@@ -256,6 +263,12 @@ class Evaluation(Result):
         with 95 % probability if forecasts are calibrated. Methods without a histogram, such as point forecasts, are
         omitted.
 
+        Args:
+            histogram: name of a histogram of values between 0 and 1, such as "PIT".
+
+        Returns:
+            A matplotlib figure.
+
         Raises:
             KeyError: when no method has the histogram.
         """
@@ -291,6 +304,9 @@ class Evaluation(Result):
         """Draw PIT histograms at some frames of the future, and coverage over these frames, for each method.
 
         Bands are two standard errors, clustered by clip. The scores come from `scores.over_horizon`.
+
+        Returns:
+            A matplotlib figure.
 
         Raises:
             KeyError: when no method has a histogram of a single frame.

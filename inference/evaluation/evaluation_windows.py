@@ -1,4 +1,4 @@
-"""Held-out windows, prepared once for all models, and the conditions under which each model is evaluated."""
+"""Held-out windows, prepared once for all models, and evaluation mode with a fixed seed."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

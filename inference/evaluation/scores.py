@@ -328,7 +328,7 @@ def by_step(measure: Measure, steps: Sequence[int], step: str = "step") -> list[
 def _part(
     measure: Measure, function: Callable[[Tensor, Tensor, Batch, Tensor], Tensor], part: Callable[[Tensor], Tensor]
 ) -> Measure:
-    """Return a score of a part of the future; it is NaN for windows where nothing of this part was observed."""
+    """Return a score of a part of the future; it is NaN for windows that have no observed value in this part."""
 
     def part_score(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         scores = function(forecasts, truth, past, index)

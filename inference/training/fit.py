@@ -120,7 +120,11 @@ class Fit:
         return f"{best}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
 
     def series(self, name: str) -> tuple[list[int], list[float]]:
-        """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound"."""
+        """Return the steps and values of one number of the log, such as "kl/z" or "validation/bound".
+
+        Args:
+            name: key of the rows of `history`.
+        """
         rows = [row for row in self.history if name in row]
         return [row["step"] for row in rows], [row[name] for row in rows]
 
@@ -129,6 +133,9 @@ class Fit:
         """Draw the learning curves: the bound, and the KL of each latent, in nats per step.
 
         For a model without a likelihood, draw the loss and its energies, per step.
+
+        Returns:
+            A matplotlib figure.
         """
         from matplotlib import pyplot as plt
 

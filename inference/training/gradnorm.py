@@ -45,9 +45,9 @@ class GradNorm:
         tasks: names of log-likelihoods and energies, at least two.
         shared: prefix of the names of the parameters W, such as a last layer that all tasks use.
         others: objective that weighs all other terms, including the KL, and defines `draws` and `select`.
-        asymmetry: a, the strength with which slowly training tasks are favoured. At 0, norms of gradients are
-            equalised. Above 0, losses must be positive, which negative log densities need not be. The paper uses 0.12,
-            and 1.5 if tasks differ more.
+        asymmetry: a, how strongly the weights favour slowly training tasks. At 0, norms of gradients are equalised.
+            Above 0, losses must be positive; negative log densities may violate this. The paper uses 0.12, and 1.5 if
+            tasks differ more.
         learning_rate: learning rate of log w, the change per step for a task whose gradient has the mean norm.
 
     Raises:
@@ -87,7 +87,16 @@ class GradNorm:
         return self.weighted(terms, step, torch.ones(len(self.tasks)))
 
     def weighted(self, terms: "Terms", step: int, weights: Tensor) -> Tensor:
-        """Return the loss with the given weights (tasks,), a scalar."""
+        """Return the loss with the given weights (tasks,), a scalar.
+
+        Args:
+            terms: terms of the bound.
+            step: global step, for schedules of `others`.
+            weights: weights (tasks,), in the order of `tasks`.
+
+        Raises:
+            ValueError: the model has no log-likelihood or energy with the name of a task.
+        """
         other_terms = [
             {name: value for name, value in table.items() if name not in self.tasks}
             for table in (terms.log_likelihood, terms.energies)
@@ -98,7 +107,14 @@ class GradNorm:
         return loss
 
     def losses(self, terms: "Terms") -> list[Tensor]:
-        """Return the losses of the tasks in their order, scalars."""
+        """Return the losses of the tasks in their order, scalars, each divided by the number of frames.
+
+        Args:
+            terms: terms of the bound.
+
+        Raises:
+            ValueError: the model has no log-likelihood or energy with the name of a task.
+        """
         costs = {name: -value for name, value in terms.log_likelihood.items()} | terms.energies
         if unknown := [task for task in self.tasks if task not in costs]:
             raise ValueError(
@@ -108,7 +124,14 @@ class GradNorm:
         return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
 
     def begin(self, model: nn.Module) -> "Balance":
-        """Return the objective for a stage of a run, with its own weights, which start at 1."""
+        """Return the objective for a stage of a run, with its own weights, which start at 1.
+
+        Args:
+            model: model to train.
+
+        Raises:
+            ValueError: no trained parameter has a name that starts with `shared`.
+        """
         trained = {name: value for name, value in model.named_parameters() if value.requires_grad}
         shared = [value for name, value in trained.items() if name.startswith(self.shared)]
         if not shared:

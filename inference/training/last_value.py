@@ -1,6 +1,6 @@
 """Log density of a forecast that repeats the last value: a reference for bounds on validation windows.
 
-    x_t ~ N(x_s, v_{t-s}),    s: the last step before t at which the coordinate was observed
+    x_t ~ N(x_s, v_{t-s}),    s: the last step before t with an observed value of the coordinate
 
 v_h is the mean square of x_{t+h} - x_t over training windows, for each coordinate. For a model that reads the true
 past, the reference is this density given all steps before t.

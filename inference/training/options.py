@@ -102,6 +102,10 @@ class Stage:
             sequences share (`distributions.Subset`); None for 1.
         frozen: prefixes of names of parameters that are not trained.
 
+    Raises:
+        TypeError: `objective` is a class instead of an instance.
+        ValueError: `steps` is less than 1, or the curriculum leaves the range from 0 to 1.
+
     Example:
         >>> import dvae
         >>> stages = [dvae.Stage(500, dvae.Evidence(kl_weight=0.1)), dvae.Stage(1500, frozen=("generator.z.",))]

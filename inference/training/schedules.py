@@ -26,7 +26,11 @@ Level = Annotated[float, Range()]
 
 @dataclass(frozen=True)
 class Constant:
-    """The same value at every step."""
+    """The same value at every step.
+
+    Args:
+        value: value at every step.
+    """
 
     value: Level
 
@@ -69,7 +73,17 @@ class _Rise:
 
 @dataclass(frozen=True)
 class Ramp(_Rise):
-    """Linear change from `start` to `end` in `steps` steps, after `delay` steps at `start`; then constant."""
+    """Linear change from `start` to `end` in `steps` steps, after `delay` steps at `start`; then constant.
+
+    Args:
+        start: value until step `delay`.
+        end: value from step `delay + steps` on.
+        steps: number of steps of the change, at least 1.
+        delay: number of steps before the change, at least 0.
+
+    Raises:
+        ValueError: `steps` or `delay` is too small, or a value is invalid.
+    """
 
     def _share(self, elapsed: float) -> float:
         return elapsed
@@ -77,7 +91,17 @@ class Ramp(_Rise):
 
 @dataclass(frozen=True)
 class Cosine(_Rise):
-    """Half a cosine wave from `start` to `end`: slow, fast, slow. Arguments as for `Ramp`."""
+    """Half a cosine wave from `start` to `end` in `steps` steps, after `delay` steps: slow, fast, slow.
+
+    Args:
+        start: value until step `delay`.
+        end: value from step `delay + steps` on.
+        steps: number of steps of the change, at least 1.
+        delay: number of steps before the change, at least 0.
+
+    Raises:
+        ValueError: `steps` or `delay` is too small, or a value is invalid.
+    """
 
     def _share(self, elapsed: float) -> float:
         return (1 - math.cos(math.pi * elapsed)) / 2
@@ -129,6 +153,12 @@ class Piecewise:
 
     The value is constant before the first and after the last point.
 
+    Args:
+        points: pairs (step, value) in the order of steps, at least one.
+
+    Raises:
+        ValueError: there are no points, steps are not in order, or a value is not finite.
+
     Example:
         Piecewise(((0, 0.0), (500, 1.0), (1000, 1.0), (1000, 0.0), (1500, 1.0)))  # two annealing cycles
     """
@@ -164,6 +194,9 @@ _FORMER = {"Linear": "Ramp"}
 def schedule(value: float | Schedule) -> Schedule:
     """Return a number as a `Constant` schedule, and a schedule unchanged.
 
+    Args:
+        value: number or schedule.
+
     Raises:
         TypeError: for anything else.
     """
@@ -175,7 +208,14 @@ def schedule(value: float | Schedule) -> Schedule:
 
 
 def levels(value: float | Schedule) -> tuple[float, ...]:
-    """Return values whose closed range contains all values of a number or schedule."""
+    """Return values whose closed range contains all values of a number or schedule.
+
+    Args:
+        value: number or schedule.
+
+    Raises:
+        TypeError: the value is neither a number nor a schedule.
+    """
     match schedule(value):
         case Constant(level):
             return (level,)
@@ -248,6 +288,9 @@ def to_config(value: Any) -> Any:
 
     Numbers, text and None are returned unchanged; mappings and sequences are searched.
 
+    Args:
+        value: schedule, number, text or None, or a mapping or sequence of these.
+
     Raises:
         TypeError: for a value that JSON cannot represent.
     """
@@ -265,6 +308,9 @@ def to_config(value: Any) -> Any:
 
 def from_config(config: Any) -> Any:
     """Return the value that `to_config` converted.
+
+    Args:
+        config: result of `to_config`, as read from JSON.
 
     Raises:
         ValueError: when "schedule" is not the name of a schedule, or its arguments do not fit.

@@ -132,7 +132,11 @@ class SVI:
 
     @property
     def state(self) -> State:
-        """State of the run, after `init`."""
+        """State of the run, after `init`.
+
+        Raises:
+            RuntimeError: `init` has not been called.
+        """
         if self._state is None:
             raise RuntimeError("the run has not begun; call init() first")
         return self._state
@@ -150,7 +154,11 @@ class SVI:
 
     @torch.inference_mode(False)
     def init(self) -> State:
-        """Start at step 0 with a new optimiser and the random numbers of the seed; the weights do not change."""
+        """Start at step 0 with a new optimiser and the random numbers of the seed; the weights do not change.
+
+        Returns:
+            State at step 0.
+        """
         training = self.training
         with no_fork:  # imports lightning-fabric, and the first optimiser imports parts of torch
             self.fabric: Fabric = processes.launch(training)
@@ -177,6 +185,9 @@ class SVI:
 
         Args:
             batch: x as a tensor (B, T, D), or a batch.
+
+        Returns:
+            Terms of the bound of each sequence, in nats.
 
         Raises:
             NonFiniteError: when the loss or a gradient is NaN or infinite; the weights do not change.
@@ -222,7 +233,11 @@ class SVI:
         return terms
 
     def row(self) -> dict[str, float]:
-        """Return the numbers of the last step, in nats per frame (see `trackers`)."""
+        """Return the numbers of the last step, in nats per frame (see `trackers`).
+
+        Raises:
+            RuntimeError: no step has been taken since `init`.
+        """
         if self.state.terms is None:
             raise RuntimeError("no step has been taken since init(); call step() first")
         loss, norm = self._numbers
@@ -256,6 +271,9 @@ class SVI:
 
         Without a likelihood, or if the objective selects by "loss", the best weights have the lowest loss. At a stage
         with another objective, this comparison starts again.
+
+        Args:
+            data: validation data, as in `evaluate`.
         """
         state, row = self.state, self.evaluate(data)
         prefix = "scheduled_sampling/" if self.final_feeding else ""
@@ -275,7 +293,11 @@ class SVI:
         return before is now or before == now
 
     def rates(self, step: int) -> dict[str, float]:
-        """Return learning rate, probability of scheduled sampling and, if any, curriculum at a global step."""
+        """Return learning rate, probability of scheduled sampling and, if any, curriculum at a global step.
+
+        Args:
+            step: global step, from 0.
+        """
         _, stage = stage_at(self.plan, step)
         defaults = {"learning_rate": self.training.rate, "scheduled_sampling": self.training.scheduled_sampling}
         stage_rates = {name: getattr(stage, name) for name in defaults}
@@ -290,11 +312,19 @@ class SVI:
             yield
 
     def total(self, value: Tensor) -> Tensor:
-        """Return the sum over the processes."""
+        """Return the sum over the processes.
+
+        Args:
+            value: value of this process.
+        """
         return processes.sum_over_processes(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Return the mean over processes of a value per frame, weighted by their numbers of frames in the last step."""
+        """Return the mean over processes of a value per frame, weighted by their numbers of frames in the last step.
+
+        Args:
+            value: value per frame of this process.
+        """
         return self.total(value * self._share)
 
     def settle(self) -> None:

@@ -91,7 +91,7 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         return self.with_presets({**self.presets[""], "heading": False})
 
     def fed(self) -> ScheduledSampling | InputNoise:
-        """Return what the network reads in training in place of the true past: its own output, or noisy data.
+        """Return the replacement for the true past in training: the own output of the network, or noisy data.
 
         A schedule sets the probability of its own output, or the scale of the noise.
         """

@@ -58,7 +58,8 @@ class DLow(ModesMethod):
     Args:
         beta: weight of the KL divergence of each mode's latents from N(0, I).
         diversity: lambda, weight of the similarity of the futures; None, here and below, for the preset.
-        diversity_scale: s, squared distance of two futures at which their similarity is 1 / e, in square metres.
+        diversity_scale: s, scale of squared distances between futures, in square metres; two futures at this distance
+            have similarity 1 / e.
         reconstruction: weight of the squared error of the best future.
         held: parts of the body, or joints, with the same motion in all modes, such as "lower".
         hold: weight of the squared distance of held joints from their positions in the first mode, averaged over the

@@ -47,8 +47,8 @@ class DSF(ModesMethod):
 
     Args:
         beta: weight of half the squared norm of the latents, mean over modes; the paper has no such term.
-        diversity_scale: s, squared distance of two futures at which their similarity is 1 / e, in square metres; by
-            default as in DLow.
+        diversity_scale: s, scale of squared distances between futures, in square metres; two futures at this distance
+            have similarity 1 / e. The default is the value of DLow.
         quality: omega, quality of a latent within the radius R.
         radius: rho, probability under N(0, I) of a latent within the radius R, which determines R.
     """

@@ -356,7 +356,7 @@ class GSPSModel(EnergyModel):
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:
-    """Return the generative factorization of parts, each of which reads the parts before it.
+    """Return the generative factorization of parts; each part reads all earlier parts.
 
     Args:
         parts: names of the parts, in the order of their prediction.

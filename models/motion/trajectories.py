@@ -1,6 +1,6 @@
 """Base of the methods that complete a motion from one pose and given paths of some joints.
 
-    s the first pose, y_{1:T} the given trajectories, r_{1:T} those of the other joints, x_{1:T} the motion
+    s the first pose, y_{1:T} the given trajectories, r_{1:T} all other trajectories, x_{1:T} the motion
 
 Poses are positions in metres relative to the first pelvis, so that the body moves through space. y and r are copies of
 x with zeros at all other joints. In training, every joint of a window is given with probability `keep`, over all its

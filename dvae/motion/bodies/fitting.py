@@ -267,7 +267,7 @@ class _Source(NamedTuple):
         return torch.from_numpy(scipy.optimize.least_squares(off, np.zeros(size), bounds=(-MOST, MOST)).x)
 
     def steepness(self, clips: Iterable[Mapping[str, Tensor]], fps: float) -> Tensor:
-        """Return the median angle in radians by which toes are below ankles in feet that stand flat; NaN if none does.
+        """Return the median slope in radians from ankle to toe in flat feet, positive downwards; NaN without flat feet.
 
         Args:
             clips: positions (F, 3) by part of each clip.

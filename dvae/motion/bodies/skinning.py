@@ -84,13 +84,20 @@ class Body(nn.Module):
         return len(self.names)
 
     def at_rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
-        """Return vertices (..., V, 3) and joints (..., J, 3) in metres at rest, from shape parameters (..., S)."""
+        """Return vertices (..., V, 3) and joints (..., J, 3) in metres at rest, from shape parameters (..., S).
+
+        Args:
+            shape: shape parameters (..., S).
+        """
         return _changed(self.template, self.shapes, shape), self._pivots(shape)
 
     def offsets(self, shape: Tensor) -> Tensor:
         """Return rest offsets (..., J, 3) of joints from their parents in metres, from shape parameters (..., S).
 
         The offset of the root is 0.
+
+        Args:
+            shape: shape parameters (..., S).
         """
         average, changes = self._bones()
         return (average + (changes @ shape[..., None, :, None].to(average)).squeeze(-1)).to(shape)
@@ -101,6 +108,9 @@ class Body(nn.Module):
         Offsets are linear in the parameters, so this inverts `offsets` where joints determine a parameter; for the
         bundled person, these are all except girth. Undetermined parameters are 0. For offsets that no shape has, the
         result is the least-squares solution.
+
+        Args:
+            offsets: offsets (..., J, 3) of joints from their parents at rest, in metres.
         """
         average, changes = self._bones()
         parameters = torch.linalg.pinv(changes.flatten(0, 1), rtol=RANK_TOLERANCE)

@@ -45,6 +45,9 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
         path: npz file of the model.
         shapes: number of shape parameters S; the first S of the file are used.
 
+    Returns:
+        Body with 22 joints and S shape parameters.
+
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: the file is damaged, too large, or not a body; or `shapes` is not between 1 and the file's number.

@@ -74,7 +74,12 @@ class Clip:
         return len(self.positions)
 
     def between(self, start: int, end: int) -> Clip:
-        """Return the clip of the frames from `start` (inclusive) to `end` (exclusive)."""
+        """Return the clip of the frames from `start` (inclusive) to `end` (exclusive).
+
+        Args:
+            start: first frame, from 0.
+            end: frame after the last one.
+        """
         rotations = None if self.rotations is None else self.rotations[start:end]
         truth = {k: v[start:end] if v.shape[:1] == (self.frames,) else v for k, v in self.truth.items()}
         return replace(self, positions=self.positions[start:end], rotations=rotations, truth=truth)
@@ -84,6 +89,9 @@ class Clip:
 
         A whole ratio keeps every `ratio`-th frame. Otherwise, positions are interpolated linearly and rotations along
         the shortest arc. Simulator variables (`truth`) are dropped.
+
+        Args:
+            ratio: number of present frames per new frame; may be fractional.
         """
         if abs(ratio - round(ratio)) < 1e-6 and ratio >= 1:
             step = round(ratio)
@@ -294,6 +302,9 @@ class MotionSet:
 
         Rotations from files are kept. Other rotations are estimated by `kinematics.inverse`, which assumes that every
         bone has its mean length over all clips. Positions do not change.
+
+        Raises:
+            ValueError: rotations must be estimated for a clip with missing joints.
         """
         if self.skeleton.rest and all(clip.rotations is not None for clip in self):
             return self
@@ -371,6 +382,9 @@ class MotionSet:
 
     def resampled(self, fps: float) -> MotionSet:
         """Return the same motion at another frame rate, as `Clip.resampled` does.
+
+        Args:
+            fps: new frame rate, in frames per second.
 
         Raises:
             ValueError: `fps` is not positive.

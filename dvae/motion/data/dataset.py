@@ -51,7 +51,7 @@ def apply_splits(motion: MotionSet, protocol: Protocol) -> MotionSet:
 
 @dataclass(frozen=True)
 class Recordings:
-    """Record of the file from which motion data were read.
+    """Record of the file that contains motion data.
 
     Args:
         path: file as it was given, or "simulated".
@@ -112,6 +112,9 @@ class MotionData:
             missing: keep clips in which joints are missing (NaN) in some frames.
             representation: input of the models; overrides the representation of the protocol.
 
+        Returns:
+            Clips, divided into splits, with their protocol.
+
         Raises:
             FileNotFoundError: the file does not exist.
             ValueError: the file cannot be read, or the protocol is unknown.
@@ -129,7 +132,14 @@ class MotionData:
         return cls(name, split, protocol, skip_bad, undivided=undivided)
 
     def windows(self, split: str) -> Windows:
-        """Return the windows of "train", "validation", "test" or "train+validation"."""
+        """Return the windows of "train", "validation", "test" or "train+validation".
+
+        Args:
+            split: "train", "validation", "test" or "train+validation".
+
+        Raises:
+            ValueError: the split is unknown, or it has no window.
+        """
         return windows(self.motion, self.protocol, split)
 
     def parts(self) -> dict[str, str]:
@@ -183,6 +193,9 @@ class MotionData:
             source: result of `recorded`.
             schema: schema of the windows.
             path: current path, if the data have moved.
+
+        Returns:
+            Clips of the file, with the protocol of the schema.
 
         Raises:
             FileNotFoundError, ValueError: same as `open`.

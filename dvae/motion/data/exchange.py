@@ -123,7 +123,11 @@ class ExchangedWindows:
         return batch
 
     def labels(self, name: str) -> list[str]:
-        """Return the label of each window's clip."""
+        """Return the label of each window's clip.
+
+        Args:
+            name: name of the label, such as "action".
+        """
         labels = self.windows.labels(name)
         return [labels[n] for n in self._rows.tolist()]
 

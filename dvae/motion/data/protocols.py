@@ -55,8 +55,8 @@ class Protocol:
         train_stride, test_stride: frames between the starts of successive windows, where windows are listed and not
             drawn, for training and for test.
         root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1). "relative": all
-            frames are relative to one position, the pelvis in the first frame of the window in which it was observed.
-            Global motion is then kept, and D = 3 J.
+            frames are relative to one position, the first observed pelvis of the window. Global motion is then kept,
+            and D = 3 J.
         multimodal_threshold: distance in metres. If the last observed poses of test windows are closer than this, the
             futures of all these windows are possible futures of each.
         split_by: "split", or the label that assigns clips to splits.
@@ -171,7 +171,13 @@ class Poses(Schema):
 
     @classmethod
     def from_data(cls, protocol: Protocol, skeleton: Skeleton, length: int | None = None) -> Self:
-        """Return the schema of windows that a protocol cuts, optionally with another length."""
+        """Return the schema of windows that a protocol cuts, optionally with another length.
+
+        Args:
+            protocol: protocol that cuts the windows.
+            skeleton: skeleton of the clips.
+            length: number of frames T; None for the length of the protocol.
+        """
         view = cls._view(protocol, skeleton)
         size = view.size if isinstance(view, Rotations) else 3 * (skeleton.joints - (protocol.root == "drop"))
         return cls({"x": size}, length or protocol.length, protocol.observed, skeleton=skeleton, protocol=protocol)
@@ -180,6 +186,11 @@ class Poses(Schema):
     @override
     def of(cls, data: Any, who: str = "this method", representation: str = "positions") -> Self:
         """Return the schema of data, and check the representation that a model reads.
+
+        Args:
+            data: windows, data or another object with a schema.
+            who: name of the reader, for errors.
+            representation: representation that the model reads.
 
         Raises:
             SchemaError: the data have no schema of poses, or another representation.
@@ -226,7 +237,11 @@ class Poses(Schema):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Return the schema from the result of `config`."""
+        """Return the schema from the result of `config`.
+
+        Args:
+            config: dictionary that `config` returned.
+        """
         return cls.from_data(Protocol(**tuples(config["protocol"])), Skeleton(**config["skeleton"]), config["length"])
 
 
@@ -318,6 +333,9 @@ class Windows:
         missing: whether joints may be missing.
         clips: clips that are long enough.
         skipped: (split, clip, frames) of clips that are too short.
+
+    Raises:
+        ValueError: `length` is too short, or no clip is long enough.
     """
 
     def __init__(self, clips: list[Clip], motion: MotionSet, protocol: Protocol, split: str, length: int) -> None:
@@ -379,7 +397,11 @@ class Windows:
         return self.index(self.stride)
 
     def index(self, stride: int) -> list[tuple[str, str, int]]:
-        """Return (split, clip, first frame) of the windows that `all(stride)` lists."""
+        """Return (split, clip, first frame) of the windows that `all(stride)` lists.
+
+        Args:
+            stride: frames between the starts of windows.
+        """
         return list(self._keys(stride))
 
     def __len__(self) -> int:
@@ -406,6 +428,13 @@ class Windows:
 
         If joints may be missing, the batch also contains "mask", as in `all`. The same generator state gives the same
         windows.
+
+        Args:
+            batch_size: B, number of windows.
+            generator: random generator on the CPU.
+
+        Returns:
+            {"x": (B, T, D)}, and "mask" if joints may be missing.
         """
         clip_draws, start_draws, angle_draws = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
         clips = torch.searchsorted(self._weights, clip_draws * self._weights[-1], right=True)
@@ -429,11 +458,18 @@ class Windows:
         is 0 there. Poses are relative to the root, so a whole frame is missing if its root is. With root="relative", a
         missing root affects other joints only if it is missing throughout the window. Only windows that have observed
         values in both the observed and the predicted frames are listed.
+
+        Args:
+            stride: frames between the starts of windows; None for the stride of the protocol.
         """
         return self._cut_batch(*self._list(stride or self.stride), torch.Generator().manual_seed(0))
 
     def batches(self, batch_size: int) -> Iterator[Batch]:
-        """Yield the windows that `all()` lists, in batches of `batch_size`."""
+        """Yield the windows that `all()` lists, in batches of `batch_size`.
+
+        Args:
+            batch_size: largest number of windows in a batch.
+        """
         clips, starts = self._list(self.stride)
         generator = torch.Generator().manual_seed(0)
         for rows in torch.arange(len(clips)).split(batch_size):
@@ -459,6 +495,9 @@ class Windows:
 
     def labels(self, name: str) -> list[str]:
         """Return the label of every listed window's clip; an empty string if the clip has none.
+
+        Args:
+            name: name of the label, such as "action".
 
         Raises:
             KeyError: no clip has such a label.
@@ -495,6 +534,12 @@ class Windows:
         """Return joint positions (..., T, J, 3) of frames (..., T, D), for drawings and bone lengths.
 
         A dropped root is added at the origin.
+
+        Args:
+            x: frames (..., T, D).
+
+        Raises:
+            ValueError: D does not match the skeleton.
         """
         if x.shape[-1] != self.size:
             raise ValueError(
@@ -597,7 +642,11 @@ class Windows:
         return description
 
     def with_protocol(self, protocol: Protocol) -> Windows:
-        """Return these windows, cut by another protocol that splits clips and counts frames in the same way."""
+        """Return these windows, cut by another protocol that splits clips and counts frames in the same way.
+
+        Args:
+            protocol: the other protocol.
+        """
         windows = copy(self)
         windows.protocol = protocol
         return windows

@@ -206,7 +206,22 @@ def make_scene(
     every: int | None = None,
     view: float = pi / 5,
 ) -> Scene:
-    """Return the scene of an animation; arguments and errors are the same as in `player.animate`."""
+    """Return the scene of an animation: observed motion, sampled futures and, if known, the true future.
+
+    Args:
+        skeleton: skeleton of the poses.
+        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing.
+        samples: (K, H, J, 3) in metres; None to draw only the observed motion, with time zero at its first pose.
+        truth: (F, J, 3) in metres with F at most H, NaN where a joint is missing; None if unknown.
+        names: names of the K samples; numbers by default.
+        fixed: indices of joints that move in the same way in all samples.
+        every: number of frames between drawn frames; by default, about 25 frames per second are drawn.
+        view: angle in radians between the last observed heading and the viewer.
+
+    Raises:
+        ValueError: the shapes do not match each other or the skeleton, an array is empty, a position is not finite, or
+            `names`, `fixed` or `every` do not match the motion.
+    """
     only_observed = samples is None
     if only_observed:
         motion = np.asarray(observed)

@@ -107,6 +107,10 @@ def save(path: str | Path, motion: MotionSet) -> None:
     several archives fit into one folder. Each file replaces an older file or link only after a complete write.
     Rotations are separate members, "split/clip.rotations".
 
+    Args:
+        path: path of the npz.
+        motion: clips to write.
+
     Raises:
         OSError: a file cannot be written; the message names it.
         ValueError: the name of a clip contains a slash, which would be read as part of the split, or `read_motion`
@@ -291,6 +295,9 @@ def read_paths(path: str | Path) -> dict[str, np.ndarray]:
     Args:
         path: an npz file with one array per joint; or a csv file whose header names three columns per joint, as in
             `LWrist_x,LWrist_y,LWrist_z`, with one row per frame and empty cells for unknown values.
+
+    Returns:
+        Paths (frames, 3) in metres, by name of the joint.
 
     Raises:
         FileNotFoundError: the file does not exist.

@@ -2,9 +2,9 @@
 
 The files contain no bone lengths. These depend on the SMPL body, which has its own licence, and on the shape parameters
 `betas`, which each clip stores as a label (`bodies.betas` reads it). Without the SMPL body, all people have one average
-body with a height of 1.7 m. Its segments are those of Drillis and Contini (1966) in figure 4.1 of Winter, Biomechanics
-and Motor Control of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the position of
-its template to `trans`. Files written here also contain `offsets`, which are used when they are read.
+body with a height of 1.7 m. Its segment lengths are from Drillis and Contini (1966), in figure 4.1 of Winter,
+Biomechanics and Motor Control of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the
+position of its template to `trans`. Files written here also contain `offsets`, which are used when they are read.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ class Angles:
         return {"joints": names, "angles": int(self.varying.sum()), "title": ["Euler angles"]}
 
     def all(self) -> Batch:
-        """Return a batch with the angles of the N windows and the observed frames from which models forecast.
+        """Return a batch with the angles of the N windows, and the observed frames that models read.
 
         The angles are "x", (N, 1 + times, A), in radians, for the A angles that vary. The observed frames are `MOTION`.
         """
@@ -215,7 +215,7 @@ class AngleModel(nn.Module):
 
         Args:
             batch: batch of `Angles`, with the observed frames of B windows.
-            horizon: ignored; the times are those of the `Angles` that this object was built for.
+            horizon: ignored; the `Angles` of this object determine the times.
             samples: S, number of futures of each window.
             options: further arguments of the model's `forecast`.
         """

@@ -64,7 +64,7 @@ def resting(parents: Sequence[int], offsets: Tensor) -> Tensor:
 
 
 def inverse(skeleton: Skeleton, positions: Tensor, offsets: Tensor) -> Tensor:
-    """Return local rotations with which `forward` approximates the directions of a pose's bones.
+    """Return local rotations that make `forward` approximate the directions of a pose's bones.
 
     Each joint with several children is rotated by Procrustes analysis of the unit vectors to its children. A joint with
     one child gets the smallest rotation relative to its parent that aligns the bone to the child exactly. A joint

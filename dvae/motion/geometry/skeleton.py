@@ -212,6 +212,9 @@ class Skeleton:
     def find(self, joint: str) -> int:
         """Return the index of a joint by its name, or by another spelling such as left_wrist for LWrist.
 
+        Args:
+            joint: name of the joint.
+
         Raises:
             ValueError: no joint, or more than one joint, has this name; the message suggests the most similar name.
         """
@@ -258,11 +261,20 @@ class Skeleton:
         return "xyz".index(self.up)
 
     def without_root(self, joints: Tensor) -> Tensor:
-        """Return joints (..., J, 3) without the root, (..., J - 1, 3)."""
+        """Return joints (..., J, 3) without the root, (..., J - 1, 3).
+
+        Args:
+            joints: values (..., J, 3).
+        """
         return torch.cat([joints[..., : self.root, :], joints[..., self.root + 1 :, :]], -2)
 
     def with_root(self, joints: Tensor, value: float = 0.0) -> Tensor:
-        """Return joints (..., J, 3); if the root is missing, insert it with the given value in all coordinates."""
+        """Return joints (..., J, 3); if the root is missing, insert it with the given value in all coordinates.
+
+        Args:
+            joints: values (..., J, 3) or (..., J - 1, 3).
+            value: coordinates of an inserted root.
+        """
         if joints.shape[-2] == self.joints:
             return joints
         root = torch.full_like(joints[..., :1, :], value)
@@ -320,6 +332,9 @@ class Skeleton:
 
     def directions(self, poses: Tensor) -> Tensor:
         """Return unit vectors along the limbs (..., 3 (J - 1)) of poses (..., D); zero for a limb of length zero.
+
+        Args:
+            poses: poses (..., D) in metres.
 
         Raises:
             ValueError: D is not valid for `limbs`.
@@ -398,6 +413,12 @@ class Skeleton:
     def from_json(cls, path: str | Path) -> Skeleton:
         """Read a skeleton file in the format of `to_json`.
 
+        Args:
+            path: path of the file.
+
+        Returns:
+            The skeleton.
+
         Raises:
             FileNotFoundError: the file does not exist.
             ValueError: the file is not a JSON object, has no joint_names or parents, or does not describe a skeleton.
@@ -435,7 +456,11 @@ class Skeleton:
             raise ValueError(f"{path}: {error}") from error
 
     def to_json(self, path: str | Path) -> None:
-        """Write the skeleton as a readable JSON file; an existing file is replaced only after a complete write."""
+        """Write the skeleton as a readable JSON file; an existing file is replaced only after a complete write.
+
+        Args:
+            path: path of the file.
+        """
         fields = {**{key: getattr(self, field) for field, key in FIELDS.items()}, "units": "m"}
         if self.lengths:
             lengths = iter(self.lengths)

@@ -83,12 +83,22 @@ class Heading(View):
         """Return headings (...) in radians of windows (..., T, D), or of poses (..., D) if `pose` is set.
 
         Coordinates of unobserved joints are NaN.
+
+        Args:
+            x: windows (..., T, D), or poses (..., D), in metres.
+
+        Raises:
+            ValueError: D does not match the skeleton.
         """
         frames = x[..., None, :] if self.pose else x
         return self.skeleton.heading_near(self._joints(frames), min(self.frames, frames.shape[-2]) - 1)
 
     def face(self, x: Tensor) -> Tensor:
-        """Return windows (..., T, D), each rotated to heading zero."""
+        """Return windows (..., T, D), each rotated to heading zero.
+
+        Args:
+            x: windows (..., T, D) in metres.
+        """
         return self._rotate(x, -self.of(x), 2)
 
     def _rotate_all(self, values: Batch, angle: Tensor) -> Batch:

@@ -35,6 +35,9 @@ def statistics(windows: Windows | ExchangedWindows) -> dict[str, Statistic]:
 
     If joints are missing, means are over the known differences, bones and feet, and the lowest joint is the lowest
     known one.
+
+    Args:
+        windows: windows with a skeleton, for joint names and the frame rate.
     """
     skeleton = windows.skeleton
     up, fps = skeleton.vertical, skeleton.fps
@@ -76,6 +79,9 @@ def draw_traversal(
         frame: index of the frame, the last by default.
         sequence: index of the sequence in the batch.
         rows: number of coordinates to draw.
+
+    Returns:
+        A matplotlib figure.
     """
     from ..drawing.plot import SPACING, final_heading, hide_axes, pose
 

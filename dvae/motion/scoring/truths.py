@@ -96,7 +96,11 @@ class PseudoTruths:
         return len(self._last)
 
     def turn(self, x: Tensor) -> Tensor:
-        """Return windows (..., T, D), rotated about the up axis so that the last observed frame has heading zero."""
+        """Return windows (..., T, D), rotated about the up axis so that the last observed frame has heading zero.
+
+        Args:
+            x: windows (..., T, D) in metres.
+        """
         return Heading(self._skeleton, self._observed).face(x)
 
     def of(self, x: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -192,6 +196,10 @@ class WithPseudoTruths:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Draw windows like `Windows.sample`, rotated to heading zero if `truths.heading` is set.
+
+        Args:
+            batch_size: B, number of windows.
+            generator: random generator on the CPU.
 
         Returns:
             "x" (B, T, D), "pseudo" (B, M, T, D) and "valid" (B, M), as from `PseudoTruths.of`. If joints may be

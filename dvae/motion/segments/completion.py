@@ -2,9 +2,9 @@
 
     p(z) p(beta) p(observations | z, beta),    z, beta* = argmax log p(z, beta | observations)
 
-A decoder maps z to a segment, including its timing, and beta to a body. The search finds the z and beta that agree best
-with the observations (Marsot et al. 2021, arXiv 2106.04387, sections 5.4 and 5.5). The observations of B segments are
-one batch, NaN where unobserved, with any combination of
+A decoder maps z to a segment with its timing, and beta to a body. The search finds the most probable z and beta given
+the observations (Marsot et al. 2021, arXiv 2106.04387, sections 5.4 and 5.5). The observations of B segments are one
+batch with some of these entries, in metres, NaN where unobserved:
 
     times     (B, K)        seconds from the first frame of the segment to the observed moments
     frames    (B, K)        the corresponding frames of chi, from 0; fractions are allowed
@@ -13,9 +13,9 @@ one batch, NaN where unobserved, with any combination of
     markers   (B, K, L, 3)  some vertices
     beta      (B, S)        the body, if it is known
 
-in metres, for a person who starts at the origin with heading zero. Moments without a frame are located in the decoded
-time, with linear interpolation between the frames of chi. Moments with both are located at the frame, and their time is
-an observation.
+The person starts at the origin with heading zero. A moment without a frame is located by its time, with linear
+interpolation between the decoded times of the frames of chi. A moment with a frame is located at this frame, and its
+time, if given, is an observation.
 
 The paper adds squared errors with adaptive weights. Here the squared errors are negative log densities of normal
 distributions, and the `Deviations` act as weights. The minimum of their sum is therefore the mode of a posterior, which
@@ -298,7 +298,13 @@ class Completed:
         return self.program.model
 
     def evidence(self, particles: int = 200, *, seed: int = 0, chunk: int = 4096) -> IWAEBound:
-        """Return the log evidence of the observations with its k-hat; arguments as in `Posterior.evidence`."""
+        """Return the log evidence of the observations in nats, (B,), by importance sampling, with its k-hat.
+
+        Args:
+            particles: K, number of draws from the normal approximation of the posterior.
+            seed: seed of the draws.
+            chunk: largest number of segments times particles in memory.
+        """
         with evaluating(self.model):
             return self.posterior.evidence(self.program, self.observations, particles, seed=seed, chunk=chunk)
 
@@ -499,11 +505,15 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
 
 
 def _shrink(means: Tensor, variance: Tensor) -> Tensor:
-    """Return the covariance (Z, Z) of a mixture of N normals with these means (N, Z) and mean variances (Z,).
+    """Return the covariance (Z, Z) of a mixture of N normals, shrunk towards a multiple of the identity.
 
-    It is shrunk towards a multiple of the identity by oracle approximating shrinkage (Chen, Wiesel, Eldar and Hero
-    2010, IEEE Transactions on Signal Processing 58:10), so that a prior from few segments does not exclude different
-    segments. The estimator assumes independent means. If many segments are from the same take, it shrinks too little.
+    The estimator is oracle approximating shrinkage (Chen, Wiesel, Eldar and Hero 2010, IEEE Transactions on Signal
+    Processing 58:10). Without it, a prior from few segments would exclude different segments. The estimator assumes
+    independent means, so it shrinks too little if many segments are from the same take.
+
+    Args:
+        means: means (N, Z) of the normals.
+        variance: variances (Z,), averaged over the normals.
     """
     (n, p), centred = means.shape, means - means.mean(0)
     covariance = (centred.mT @ centred) / n + variance.diag()

@@ -36,7 +36,7 @@ def subsample_clips(clips: Sequence[Clip], many: int) -> list[Clip]:
 
 @dataclass(frozen=True)
 class SegmentSource:
-    """Record of the file and the options from which segments were read.
+    """Record of the file of the segments, and of the options for reading it.
 
     Args:
         path: path of the file as the user gave it, or "simulated".
@@ -103,6 +103,9 @@ class SegmentData:
             skip_bad: leave out unusable clips instead of raising an error.
             **options: cut, scaling, warped, bodies and seen, as in the class.
 
+        Returns:
+            Takes, divided into splits, and their segments.
+
         Raises:
             FileNotFoundError: the file does not exist.
             ValueError: the file cannot be read, or an option is invalid.
@@ -156,6 +159,9 @@ class SegmentData:
     def windows(self, split: str) -> Segments:
         """Return the segments of "train", "validation" or "test".
 
+        Args:
+            split: "train", "validation" or "test".
+
         Raises:
             ValueError: the split is unknown or empty.
         """
@@ -203,6 +209,9 @@ class SegmentData:
             source: result of `recorded`.
             schema: schema of the run.
             path: path of the data now, or of other data; default: the recorded path.
+
+        Returns:
+            Segments of the file, with the conversion to frames of the schema.
 
         Raises:
             FileNotFoundError, ValueError: same as `open`.

@@ -59,7 +59,7 @@ class SegmentSchema(Schema):
     @property
     @override
     def windows(self) -> Schema:
-        """Schema without the representation of frames; runs for which it is equal can be evaluated on the same data."""
+        """Schema without the representation of frames; runs can share evaluation data if it is equal."""
         return Schema({SHAPE: self.size(SHAPE)})
 
     @override
@@ -183,8 +183,11 @@ class Segments:
 
         Args:
             x: frames (B, N, D), one for each segment.
-            shape: (B, S), shape parameters; default: those of the segments.
+            shape: (B, S), shape parameters; default: the parameters of the segments.
             fps: frames per second; default: the rate of the skeleton.
+
+        Returns:
+            Clips, one for each segment, at the original positions and headings.
         """
         offsets = self.body.offsets(self._batch[SHAPE] if shape is None else shape)
         return self.timed.back({**self._start, OFFSETS: offsets, WHOLE: x}, fps)

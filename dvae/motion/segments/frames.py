@@ -139,7 +139,16 @@ class TimedFrames:
     ) -> tuple[Self, dict[str, Any]]:
         """Return the conversion from `of` and the result of its `to` for the same segments, computed together.
 
-        This is faster than two calls. Arguments and errors are the same as in `of`.
+        This is faster than two calls.
+
+        Args:
+            motion: segments with rotations.
+            frames: number of frames N.
+            scaling: scaling of rotations: "identity" subtracts the identity rotation, "deviation" standardises them.
+            references: reference cycles for time warping, as in `TimedFrames`.
+
+        Raises:
+            ValueError: the scaling is unknown, or `to` cannot convert the segments.
         """
         if scaling not in ("identity", "deviation"):
             raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
@@ -228,6 +237,9 @@ class TimedFrames:
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotations, root positions and times of frames (..., N, D), with gradients.
 
+        Args:
+            x: frames (..., N, D).
+
         Returns:
             local rotations of all joints (..., N, J, 3, 3), which are the identity for joints without children; root
             positions relative to the first frame (..., N, 3) in metres; and times since the first frame (..., N) in
@@ -244,7 +256,11 @@ class TimedFrames:
         return *self.poses(x), self.times(x)
 
     def poses(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return rotations (..., J, 3, 3) and root positions (..., 3) of any frames (..., D), with gradients."""
+        """Return rotations (..., J, 3, 3) and root positions (..., 3) of any frames (..., D), with gradients.
+
+        Args:
+            x: frames (..., D).
+        """
         turning = self.turning
         ends = [joint for joint in range(self.skeleton.joints) if joint not in turning]
         unturned = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], len(ends), 3, 3)
@@ -253,17 +269,29 @@ class TimedFrames:
         return rotations, x[..., -4:-1] * self.metres
 
     def times(self, x: Tensor) -> Tensor:
-        """Return the times of frames (..., N, D) since the first frame, (..., N) in seconds, with gradients."""
+        """Return the times of frames (..., N, D) since the first frame, (..., N) in seconds, with gradients.
+
+        Args:
+            x: frames (..., N, D).
+        """
         even = self.seconds / (self.frames - 1)
         later = x[..., -1][..., 1:].clamp(BRIEFEST) * even
         return pad(later.cumsum(-1), (1, 0))
 
     def lasts(self, x: Tensor) -> Tensor:
-        """Return the durations (...,) in seconds of segments (..., N, D), which are the sums of time increments."""
+        """Return the durations (...,) in seconds of segments (..., N, D), which are the sums of time increments.
+
+        Args:
+            x: segments (..., N, D).
+        """
         return self.times(x)[..., -1]
 
     def travels(self, x: Tensor) -> Tensor:
-        """Return the distances (...,) in metres between first and last root position of segments (..., N, D)."""
+        """Return the distances (...,) in metres between first and last root position of segments (..., N, D).
+
+        Args:
+            x: segments (..., N, D).
+        """
         first, last = self.poses(x[..., [0, -1], :])[1].unbind(-2)
         distance: Tensor = (last - first).norm(dim=-1)
         return distance

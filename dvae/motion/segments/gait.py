@@ -45,16 +45,19 @@ class Cycles:
     """Definition of a gait cycle.
 
     Args:
-        threshold: maximum mean angle in radians between the hips of a cycle and those of the reference, after their
-            time warping. It also bounds the distance between first and last pose. This excludes half cycles, which
-            end with the other foot in front.
+        threshold: maximum mean angle in radians between the hip rotations of a cycle and of the reference, after time
+            warping. It also bounds the distance between first and last pose. This excludes half cycles, which end with
+            the other foot in front.
         shortest, longest: minimum and maximum duration in seconds.
         overlap: maximum overlap of two cycles with the same starting foot, as a fraction of the shorter one.
         rate: frames per second of the comparison.
         swing: minimum standard deviation of the angle between the thighs in radians; motion below it is no gait.
-        regular: minimum regularity of a clip from which references are taken, from 0 to 2; 2 is a periodic motion. The
-            regularity is the autocorrelation of the angle between the thighs at a lag of one cycle, minus that at half
-            a cycle.
+        regular: minimum regularity of a clip that provides references, from 0 to 2 (periodic). Regularity is the
+            autocorrelation of the angle between the thighs at a lag of one cycle, minus the autocorrelation at half a
+            cycle.
+
+    Raises:
+        ValueError: an option is out of range, or `shortest` exceeds `longest`.
     """
 
     threshold: Amount = 0.25

@@ -111,7 +111,11 @@ class Interpolation:
         return replace(motion, clips=clips, name="interpolation")
 
     def vertices(self, pair: int = 0) -> Tensor:
-        """Return surfaces (M, N, V, 3) in metres of all steps of the pair with this index."""
+        """Return surfaces (M, N, V, 3) in metres of all steps of the pair with this index.
+
+        Args:
+            pair: index of the pair.
+        """
         return surfaces_of(self.timed, self.body, self.x[pair], self.shape[pair])
 
     @cached_property
@@ -135,6 +139,9 @@ def interpolate(model: Any, first: Mapping[str, Any], second: Mapping[str, Any],
         model: model of segments, such as a `motion-latent` model.
         first, second: batches of the same size with x (B, N, D) and beta (B, S) in the model's representation.
         steps: number of steps M, including the ends.
+
+    Returns:
+        Latents (B, M, Z), shapes (B, M, S) and frames (B, M, N, D) of all B pairs.
 
     Raises:
         ValueError: fewer than 2 steps, or batches of different sizes.
@@ -177,6 +184,9 @@ def falls(values: Tensor) -> Tensor:
     """Return whether values (..., M) decrease in every step, as booleans (...,).
 
     In an interpolation from a walk to a run, durations should decrease in every step.
+
+    Args:
+        values: values (..., M) by step.
     """
     return (values.diff(dim=-1) < 0).all(-1)
 
@@ -190,6 +200,9 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
         model: model of segments.
         batch: x (B, N, D) and beta (B, S), at least three segments.
         labels: label of each segment.
+
+    Returns:
+        A matplotlib figure.
 
     Raises:
         ValueError: there are too few segments, the number of labels is wrong, or there are too many distinct labels.
