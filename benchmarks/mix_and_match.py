@@ -28,11 +28,11 @@ def rows(device: torch.device) -> dict[str, float]:
     model = method.build(windows).to(device)
     objective, bound = method.train(windows).objective, dvae.SequenceELBO()
     batch = moved(windows.sample(32, torch.Generator().manual_seed(0)), device)
-    own, true = seconds(
+    own_poses, true_poses = seconds(
         *(
             training_step(model, lambda p=p: objective(bound.terms(model, batch, scheduled_sampling=p), 1000))
             for p in (1.0, 0.0)
         ),
         repeat=5,
     )
-    return {"feeding": own / true, "step": own}
+    return {"feeding": own_poses / true_poses, "step": own_poses}

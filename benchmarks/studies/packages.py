@@ -1,7 +1,7 @@
-"""Draws docs/img/packages.png of docs/project/architecture.md: packages as boxes, who imports whom as edges.
+"""Draw docs/img/packages.png of docs/project/architecture.md: packages as boxes, imports as edges.
 
-It is drawn from the imports in the files. Every box is above all that it imports; an edge that others make
-superfluous is left out, and one upward, which there should not be, is red.
+The imports come from the files. Every box is above the boxes that it imports. Edges that follow from others are left
+out. Edges that point upward are errors in the layout, and are red.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .results import DOCS
 
 ROOT = DOCS.parent / "dvae"
 EVERYWHERE = {"command", "files", "options", "locking", "lazy", "constants"}
-"""Small modules that many use and nobody looks for."""
+"""Small modules that many packages use; the picture leaves them out."""
 
 WALK = {
     "motion": "files to windows",
@@ -32,7 +32,7 @@ WALK = {
     "distributions": "features to distributions",
     "inference": "a run to bound and step",
 }
-"""From x in a file to the loss, in this order."""
+"""Packages on the way from x in a file to the loss, in this order."""
 
 SAYS = {
     "cli": "the program dvae",
@@ -44,14 +44,14 @@ SAYS = {
 
 
 def package(module: str) -> str:
-    """The package that a module is in: a.b of dvae.a.b is "a"; of dvae itself, nothing."""
+    """Return the package of a module: "a" for dvae.a.b, "" for dvae."""
     return module.split(".")[1] if "." in module else ""
 
 
 def imports() -> nx.DiGraph:
     """Return the graph of imports between packages; the attribute "lines" of a node is its number of lines."""
     graph = nx.DiGraph()
-    for file in sorted(glob("**/*.py", root_dir=ROOT, recursive=True)):  # which goes through links too
+    for file in sorted(glob("**/*.py", root_dir=ROOT, recursive=True)):  # follows symbolic links
         parts = ("dvae", *Path(file).with_suffix("").parts)
         here, text = package(".".join(parts)), (ROOT / file).read_text(encoding="utf-8")
         if here in EVERYWHERE | {"__init__"}:
@@ -71,14 +71,14 @@ def imports() -> nx.DiGraph:
 
 
 def storeys(graph: nx.DiGraph) -> list[list[str]]:
-    """Packages from the ground up, each on the lowest floor that is above all that it imports; circles share one."""
+    """Return packages by level, each on the lowest level above its imports; import cycles share a level."""
     circles = nx.condensation(graph)
     floors = nx.topological_generations(circles.reverse())
     return [sorted(name for circle in floor for name in circles.nodes[circle]["members"]) for floor in floors]
 
 
 def draw(graph: nx.DiGraph, ax: Axes) -> None:
-    """Boxes on their floors, edges down."""
+    """Draw packages as boxes on their levels, with imports as edges."""
     floors, width, height = storeys(graph), 2.3, 0.62
     places: dict[str, tuple[float, float]] = {}
     for level, floor in enumerate(floors):
@@ -130,10 +130,10 @@ def draw(graph: nx.DiGraph, ax: Axes) -> None:
 
 @styled
 def main(out: Path = DOCS / "img" / "packages.png") -> None:
-    """Draw.
+    """Draw the picture.
 
     Args:
-        out: where the picture goes.
+        out: file of the picture.
     """
     graph = imports()
     figure = new_figure(7, len(storeys(graph)))
