@@ -165,7 +165,7 @@ class Row:
             return None
         values, clips, weights = values[:, valid], np.array(first["clips"])[valid], np.array(first["weights"])[valid]
         order = {clip: place for place, clip in enumerate(dict.fromkeys(clips))}
-        if len(order) == len(clips):  # sums that are divided again would give equal seeds a rounding error
+        if len(order) == len(clips):  # no sums by clip, so that equal seeds have exactly no error
             errors = TwoWayErrors.of(values, weights)
         else:
             errors = TwoWayErrors.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))

@@ -162,8 +162,8 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
         angles = euler_errors({OURS: model}, fewer, counts=counts, **options)
         measurement["angles"] = scores_of(angles.clips, {name: plain(angles.rows[name].clip_means) for name in futures})
     if method.noise == "mix" and noise:
-        # ratios of diversity: codes with indices drawn once over codes with all drawn; futures with z at
-        # 0, which differ in their indices only, over futures with all drawn
+        # Ratios of diversity. Codes: indices drawn once over all drawn. Futures: z at 0, so that only indices differ,
+        # over all drawn.
         with seeded_evaluation(model, seed):
             all_drawn, once = (code_diversity(model, batch).mean() for batch in (past, model.read(past)))
         unsaid = dvae.evaluate({OURS: model, UNSAID: RedrawnModel(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts)

@@ -149,7 +149,7 @@ def reproducible_outputs(cell: nbformat.NotebookNode) -> list[tuple[str, dict[st
 def _stable(text: str) -> str:
     text = re.sub('src="data:[^"]*"', "", text)  # a picture
     if "<pre" in text or "━" in text:
-        # notes below a table depend on its numbers, and so does whether a part of a gap is a lower bound
+        # numbers of a table change its notes, and the mark of parts of a gap that are lower bounds
         plain = re.sub("<[^>]*>", "", text).replace(", at least", "")
         rows = [line for line in plain.splitlines() if re.search("[│┃]", line)]
         return " ".join(sorted(re.findall(r"\b[^\W\d_]{2,}\b", " ".join(rows))))

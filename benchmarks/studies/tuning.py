@@ -72,9 +72,8 @@ class Section:
         """Return the method and the training of a case."""
         options, training_options = split_options({**self.options, **self.cases[case]})
         method = options.pop("method", self.method)
-        if (
-            self.uses_pose_prior and options.get("pose_prior") != 0 and options.get("heading", True)
-        ):  # as the metric model has it
+        # the pose prior of the metric models reads poses that are rotated to one heading
+        if self.uses_pose_prior and options.get("pose_prior") != 0 and options.get("heading", True):
             options["pose_prior_run"] = str(prior)
         return dvae.method(method, **options), replace(self.training, **training_options)
 

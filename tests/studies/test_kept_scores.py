@@ -63,7 +63,7 @@ def test_scores_have_the_options_of_their_rows(of, run):
     preset = method.preset(WALKER) if isinstance(method, PoseMethod) else {}
     for name, value in json.loads(json.dumps({**preset, **now})).items():
         if name.startswith("pseudo_") and stored["method"]["multimodal"] == 0:
-            continue  # is read by that term alone
+            continue  # only the multimodal term reads it
         assert stored["method"][name] == value, name
     now = {**vars(method.trainings[""]), **training}
     for name in ("steps", "batch_size", "learning_rate", "decay"):

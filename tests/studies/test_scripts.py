@@ -480,7 +480,7 @@ def test_ranking(folder, out, monkeypatch):
     (best,) = re.findall(
         r"^May be the best, .* with 2 seeds or more: (.*)\.$", results.read("index/simulated", out).note
     )
-    assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # of the other there is one seed
+    assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # the other has one seed
     (rows,) = tables(out, "index/simulated")
     by_name = {row[0]: row for row in rows[1:]}
     assert by_name.keys() == {"zero velocity", "nearest neighbours", *methods}
@@ -612,7 +612,7 @@ def test_a_set_like_another_shares_its_metric_models_and_reference_rows(folder, 
         ranking, "fitted_metric_models", lambda data, path, names: sets_with_metric_models.append(path.name) or {}
     )
     for name in ranking.SETS:
-        assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # reference rows alone are no table
+        assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # no table of reference rows alone
         ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=(name,), scores=tmp_path / "scores")
     assert sets_with_metric_models == ["simulated", "simulated"]
     names = ranking.archive(tmp_path / "scores", "longer").names
@@ -804,13 +804,13 @@ BENCHES = {
 
 def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(benches):
     benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
-    assert benches((1.09, 3.7, 7.6, 0.9))[0] == 0  # within a tenth, or of an exponent within its bound
+    assert benches((1.09, 3.7, 7.6, 0.9))[0] == 0  # within a tenth; an exponent within its bound
     assert benches((1.3, 4.0, 9.0, 0.01), (1.05, 4.0, 7.0, 0.01))[0] == 0  # the better of two
     step = (1, "speed: step: 1.20 was 1.00 at the last release")
     assert benches((1.3, 4.0, 7.0, 0.01), (1.2, 4.0, 7.0, 0.01)) == step
-    gain = (1, "speed: gain: 2.90 was 4.00 at the last release")  # is worse where it is less
+    gain = (1, "speed: gain: 2.90 was 4.00 at the last release")  # lower is worse
     assert benches((1.0, 2.0, 7.0, 0.01), (1.0, 2.9, 7.0, 0.01)) == gain
-    cost = (1, "speed: cost: 8.00 was 7.00 at the last release")  # which has no target
+    cost = (1, "speed: cost: 8.00 was 7.00 at the last release")  # has no target
     assert benches((1.0, 4.0, 8.0, 0.01), (1.0, 4.0, 8.0, 0.01)) == cost
     assert benches((1.0, 4.0, 7.0, 1.2), (1.0, 4.0, 7.0, 1.2)) == (
         1,
@@ -827,10 +827,10 @@ def test_a_slower_row_is_compared_with_the_code_of_the_release(benches, monkeypa
     """This machine may be the slower one."""
     benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
     monkeypatch.setenv(bench.RELEASE_RUN, "1")
-    assert benches((9.0, 1.0, 9.0, 0.01))[0] == 0  # is not compared itself
+    assert benches((9.0, 1.0, 9.0, 0.01))[0] == 0  # no comparison
     monkeypatch.delenv(bench.RELEASE_RUN)
     requests = []
-    release = {"speed: step": 1.15, "speed: cost": 6.0}  # the second was not in doubt
+    release = {"speed: step": 1.15, "speed: cost": 6.0}  # the second did not get slower
     monkeypatch.setattr(bench, "measure_at_commit", lambda *given: requests.append(given[:2]) or release)
     assert benches((1.2, 4.0, 7.0, 0.01), (1.2, 4.0, 7.0, 0.01))[0] == 0
     assert benches((1.3, 4.0, 7.0, 0.01), (1.3, 4.0, 7.0, 0.01)) == (
@@ -849,7 +849,7 @@ def test_a_release_is_the_first_record_of_its_version(benches):
     first, second = json.loads(benches.history.read_text())
     assert first["rows"] == dict(zip(BENCHES, (1.0, 4.0, 7.0, 0.01), strict=True))
     assert second["rows"] == {**dict(zip(BENCHES, (1.08, 5.0, 7.0, 0.01), strict=True)), "speed: other": 3.0}
-    assert benches((1.12, 5.0, 7.0, 0.01), (1.12, 5.0, 7.0, 0.01), commit="c")[0] == 1  # though not of the second
+    assert benches((1.12, 5.0, 7.0, 0.01), (1.12, 5.0, 7.0, 0.01), commit="c")[0] == 1  # compared with the first record
     benches((1.1, 5.0, 7.0, 0.01), commit="d", version="2.0", keep=True)
     assert benches((1.2, 5.0, 7.0, 0.01), commit="e", version="2.0")[0] == 0
     assert benches.row("speed: step") == ["at most 2", "yes", "1.10", "1.00", "1.10"]
@@ -893,7 +893,9 @@ def test_recorded_products_have_the_shapes_of_the_work():
         torch.mm(x.detach(), y, out=torch.empty(3, 2))
         torch.nn.functional.scaled_dot_product_attention(query, token, token, attn_mask=torch.zeros(2, 1, 5, 6))
     shapes = [
-        [tuple(value.shape) for value in args if isinstance(value, torch.Tensor)]  # without the mask, widened or not
+        [
+            tuple(value.shape) for value in args if isinstance(value, torch.Tensor)
+        ]  # without the mask, whose shape varies
         for _, args, _ in noted.calls
     ]
     assert shapes == [
@@ -919,7 +921,7 @@ def test_packages(tmp_path):
         graph
     ) - {"cli", "data", "tables", "testing"}
     assert len(graph) <= 12
-    assert graph.has_edge("models", "inference")  # behind links, and by a relative import
+    assert graph.has_edge("models", "inference")  # through links and a relative import
     assert graph.has_edge("inference", "program")
 
 
