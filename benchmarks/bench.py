@@ -63,7 +63,7 @@ def measured(name: str, device: torch.device) -> tuple[Rows, dict[str, Target]]:
     return {f"{name}: {row}": value for row, value in values.items()}, targets
 
 
-def met(value: float, target: Target) -> bool:
+def meets(value: float, target: Target) -> bool:
     """Return whether a value meets its target."""
     side, bound = target
     return bound is None or (value <= bound if side in LESS else value >= bound)
@@ -81,14 +81,14 @@ def slower(rows: Mapping[str, float], targets: Targets, before: Mapping[str, flo
     def is_slower(row: str) -> bool:
         (side, _), now, then = targets[row], rows[row], before[row]
         costs = side in COMPARED and (now > WORSE * then if side in LESS else then > WORSE * now)
-        return costs or (met(then, targets[row]) and not met(now, targets[row]))
+        return costs or (meets(then, targets[row]) and not meets(now, targets[row]))
 
     return [row for row in rows if row in before and is_slower(row)]
 
 
 def missed(values: Mapping[str, float], targets: Targets) -> list[str]:
     """Return one message for each row that misses its target."""
-    rows = [row for row in values if not met(values[row], targets[row])]
+    rows = [row for row in values if not meets(values[row], targets[row])]
     return [f"{row}: {values[row]:.2f} must be {targets[row][0]} {targets[row][1]:g}" for row in rows]
 
 
@@ -138,9 +138,13 @@ def machine(device: torch.device) -> dict[str, Any]:
     }
 
 
-def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
+def add_record(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the history with a record added; a version keeps its first and its last record, with rows merged."""
-    alike = [each for each in records if (each["version"], how(each)) == (record["version"], how(record))]
+    alike = [
+        each
+        for each in records
+        if (each["version"], device_and_threads(each)) == (record["version"], device_and_threads(record))
+    ]
     matching = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
     merged = {
         key: {name: value for part in (*matching, record) for name, value in part[key].items()}
@@ -151,9 +155,13 @@ def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str
     return [record | merged if each is matching[0] else each for each in records]
 
 
-def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
+def release_rows(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
     """Return the reference of each row, the first number of the last version in other commits, and its commit."""
-    others = [each for each in records if how(each) == how(record) and each["commit"] != record["commit"]]
+    others = [
+        each
+        for each in records
+        if device_and_threads(each) == device_and_threads(record) and each["commit"] != record["commit"]
+    ]
     reference: dict[str, tuple[float, str]] = {}
     for each in others:
         if each["version"] == others[-1]["version"]:
@@ -161,25 +169,25 @@ def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str,
     return reference
 
 
-def how(record: dict[str, Any]) -> tuple[str, int]:
+def device_and_threads(record: dict[str, Any]) -> tuple[str, int]:
     """Return the device and the number of threads of a record; records without them are from the processor."""
     return record["machine"].get("device", "cpu"), record["machine"]["threads"]
 
 
 def tabulate(records: list[dict[str, Any]], results: Path = RESULTS) -> None:
     """Write the table of the last record and of the release; a GPU has a table of its own."""
-    last, before = records[-1], released(records, records[-1])
+    last, before = records[-1], release_rows(records, records[-1])
     lines = []
     for name in sorted(last["rows"], key=_place):
         value, (side, bound) = last["rows"][name], last["targets"].get(name, ("at most", None))
-        target = ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if met(value, (side, bound)) else "no"]
+        target = ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if meets(value, (side, bound)) else "no"]
         release = f"{before[name][0]:.2f}" if name in before else "–"
         change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
         lines.append([name, *target, f"{value:.2f}", release, change])
     commits = sorted({commit for _, commit in before.values()})
     note = f"Last: {last['version']} ({last['commit']}), {last['date']}; release: {', '.join(commits) or 'none'}."
     history = Table(["", "target", "met", "last", "release", "last over release"], lines, note)
-    write(results, {f"speed/{'history' if how(last)[0] == 'cpu' else 'gpu-history'}": history})
+    write(results, {f"speed/{'history' if device_and_threads(last)[0] == 'cpu' else 'gpu-history'}": history})
 
 
 def _place(row: str) -> int:
@@ -222,7 +230,7 @@ def main(
         "machine": machine(place),
     }
     records = json.loads(HISTORY.read_text()) if HISTORY.exists() else []
-    release = {} if RELEASE_RUN in os.environ else released(records, record)
+    release = {} if RELEASE_RUN in os.environ else release_rows(records, record)
     numbers: Rows = {}
     targets: dict[str, Target] = {}
     failed: list[str] = []
@@ -257,7 +265,7 @@ def main(
         record_now = record | {"rows": numbers, "targets": targets}
         out.write_text(json.dumps(record_now, indent=1) + "\n")
         if keep:
-            records = kept(records, record_now)
+            records = add_record(records, record_now)
             HISTORY.write_text(json.dumps(records, indent=1) + "\n")
             tabulate(records)
     for title, lines in (("targets missed:", missed(numbers, targets)), ("slower than at the last release:", failed)):

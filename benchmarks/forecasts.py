@@ -70,7 +70,7 @@ def main(files: tyro.conf.Positional[tuple[Path, ...]] = FILES, steps: int = 240
     missed = False
     for file in files:
         if not file.exists():
-            print(f"{file.name}: not there, left out")
+            print(f"{file.name}: not found, skipped")
             continue
         for name, value, side, bound in rows(file, steps, batch_size):
             holds = value <= bound if side == "at most" else value >= bound

@@ -86,7 +86,7 @@ def most(data: Path, *options: str) -> int:
             time.sleep(0.01)
         assert process.stderr is not None
         if process.returncode:
-            raise SystemExit(f"{data} was not fitted to: {process.stderr.read()}")
+            raise SystemExit(f"the fit to {data} failed: {process.stderr.read()}")
     return peak
 
 
@@ -109,7 +109,7 @@ def rows(_: torch.device) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if shutil.disk_usage(folder).free < 2.5e9:
-            raise SystemExit(f"{folder} has less than 2.5 GB of room; set TMPDIR to a folder that has more")
+            raise SystemExit(f"{folder} has less than 2.5 GB of free space; set TMPDIR to a folder with more")
         many, few = written(folder / "many.npy", FRAMES), written(folder / "few.npy", FEW)
         ratios = {"memory": most(many, *cut) / most(few, *cut), **steps(many)}
         many.unlink()

@@ -61,7 +61,7 @@ def exact(edge: AblatedEdge, ablation: dvae.Ablation) -> float:
     return dvae.Oracle(model, STEPS).fit_guide() / STEPS
 
 
-def fitted(ablation: dvae.Ablation) -> Table:
+def edge_table(ablation: dvae.Ablation) -> Table:
     """Return a table of the costs of each edge."""
     lines = []
     for edge in ablation.edges:
@@ -98,7 +98,7 @@ def main(
     on_surrogates = {"sizes": {"z": 1, "x": len(SENSORS)}, "steps": steps, "surrogates": seeds}
     ablation = dvae.ablate(method, data, runs, (0, 1, 2), {**TRAINING, "steps": fitting}, jobs, **on_surrogates)
     ablation.save(runs / "edges.json")
-    write(results, {"ablation/fitted": fitted(ablation)})
+    write(results, {"ablation/fitted": edge_table(ablation)})
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def joined(files: Sequence[Path]) -> dvae.Evaluation:
     if any(same(each) != same(first) for each in evaluations.values()):
         sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or metric models")
     if len(evaluations) < len(files):
-        sys.exit("two of these runs have one name; a row has the name of its directory")
+        sys.exit("two of these runs have the same name; rows are named after run directories, so rename one")
     rows = {name: row for name, row in first.rows.items() if not row.config}
     for name, each in evaluations.items():
         (rows[name],) = (row for row in each.rows.values() if row.config)
@@ -66,7 +66,7 @@ def main(
     names = [name for name, row in evaluation.rows.items() if row.config]
     bones = [bool(evaluation.rows[name].config["bones"]) for name in names]
     if not names or bones != [False, True] * (len(names) // 2):
-        sys.exit("name each run without bones, and behind it the same with them")
+        sys.exit("name each run without bones, followed by the same run with bones")
     pairs = list(zip(names[::2], names[1::2], strict=True))
     rows = [
         [

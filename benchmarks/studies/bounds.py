@@ -21,7 +21,9 @@ GUIDES = {
 TEMPERATURES = (10, 30, 100)
 
 
-def fitted(inference: str, steps: int, fitting: int, scale: float = 0.5) -> tuple[dvae.DynamicalVAE, dvae.Oracle]:
+def fit_best_guide(
+    inference: str, steps: int, fitting: int, scale: float = 0.5
+) -> tuple[dvae.DynamicalVAE, dvae.Oracle]:
     """Fit the best guide of a factorization; return the model and its oracle."""
     model = dvae.linear_gaussian_surrogate(MODEL, inference, {"z": 1, "x": 1}, steps, scale=scale)
     oracle = dvae.Oracle(model, steps)
@@ -32,7 +34,7 @@ def fitted(inference: str, steps: int, fitting: int, scale: float = 0.5) -> tupl
 
 def annealed(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> list[str]:
     """Return a row of lower and upper bounds minus the evidence."""
-    model, oracle = fitted(inference, steps, fitting)
+    model, oracle = fit_best_guide(inference, steps, fitting)
     samples = model.sample(sequences, steps)
     evidence = oracle.evidence(samples["x"])
     cells = []
@@ -45,7 +47,7 @@ def annealed(name: str, inference: str, steps: int, sequences: int, particles: i
 
 def row(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> list[str]:
     """Return a row of the evidence minus each bound, for the best guide of the factorization."""
-    model, oracle = fitted(inference, steps, fitting)
+    model, oracle = fit_best_guide(inference, steps, fitting)
     x = model.sample(sequences, steps)["x"]
     evidence = oracle.evidence(x)
     exact = (evidence - oracle.bound(x)).mean()

@@ -13,7 +13,7 @@ import tyro
 import dvae
 from dvae.inference.diagnostics.bracket import format_estimate
 
-from .bounds import GUIDES, fitted
+from .bounds import GUIDES, fit_best_guide
 from .results import Table, loaded, write
 
 SETTINGS: dict[str, Any] = {"particles": 32, "temperatures": 20, "chains": 4}
@@ -21,7 +21,7 @@ SETTINGS: dict[str, Any] = {"particles": 32, "temperatures": 20, "chains": 4}
 
 def known(name: str, inference: str, steps: int, count: int, fitting: int) -> list[str]:
     """Return the parts of the gap and the width of the bracket, for the best guide and data from the model."""
-    model, oracle = fitted(inference, steps, 300)
+    model, oracle = fit_best_guide(inference, steps, 300)
     x = model.sample(count, steps)["x"]
     bracket = dvae.bracket(model, x, **SETTINGS, fitting=fitting)
     evidence = oracle.evidence(x)

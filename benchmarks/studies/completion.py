@@ -47,7 +47,7 @@ from dvae.motion.segments.completion import (
 from dvae.motion.segments.dataset import SegmentData, subsample_clips
 from dvae.motion.segments.embodied import SHAPE, Segments
 
-from .engine import OURS, Row, fitted, folder, interval, read_all, read_or_measure, spread
+from .engine import OURS, Row, fit_or_load, folder, interval, read_all, read_or_measure, spread
 from .results import DOCS, Table, refuse_unknown, tabled, write
 
 PARTS = ("prediction", "completion", "uncertainty", "tuning")
@@ -161,11 +161,11 @@ DESCENTS += [dvae.Descent(200, 0.1), dvae.Descent(400, 0.05), dvae.Descent(200, 
 def open_segments(path: Path | None) -> SegmentData:
     """Open a file of segments; end the script if there is none."""
     if path is None:
-        sys.exit("something has not been measured yet; name the data and a run")
+        sys.exit("some measurements are missing; pass the data and a run")
     return SegmentData.open(path)
 
 
-def grouped(people: motion.MotionSet) -> motion.MotionSet:
+def split_by_group(people: motion.MotionSet) -> motion.MotionSet:
     """Split segments: file group A for training, group B for test."""
     splits = {"A": "train", "B": "test"}
     clips = [replace(clip, split=splits.get(clip.labels["file_group"], "unseen")) for clip in people]
@@ -198,7 +198,7 @@ class EvaluatedRun:
     def split(self, name: str) -> list[Any]:
         """Return the segments of a split."""
         people = open_segments(self.data).segments
-        return [clip for clip in (grouped(people) if self.grouped else people) if clip.split == name]
+        return [clip for clip in (split_by_group(people) if self.grouped else people) if clip.split == name]
 
     def seen(self, clips: Sequence[Any]) -> Segments:
         """Return segments with the time frames of the model."""
@@ -224,7 +224,7 @@ class EvaluatedRun:
         return complete(self.model, observations, **options, known=training)
 
 
-def scored(run: EvaluatedRun, rows: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+def scores_by_take(run: EvaluatedRun, rows: Mapping[str, Any], **more: Any) -> dict[str, Any]:
     """Return a measurement with scores by segment, grouped by take."""
     takes = [clip.labels["source"] for clip in run.segments.motion]
     return {"clips": takes, "weights": [1] * len(takes), "rows": rows, **more}
@@ -271,7 +271,7 @@ def measure_prediction(run: EvaluatedRun) -> dict[str, Any]:
     with torch.no_grad():
         near = model.decode(model.encode(batch), batch[SHAPE])
     rows[NEAR] = errors_of(run, (near, batch[SHAPE]), times)
-    return scored(run, rows, times=times)
+    return scores_by_take(run, rows, times=times)
 
 
 def fit_residual(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
@@ -283,7 +283,7 @@ def fit_residual(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
     takes_data = motion.MotionData(str(data.path), takes, protocol(takes.skeleton.fps))
     training = {"steps": steps, "validate_every": max(steps // 3, 1), **TRAINING}
     method = dvae.method("mix-and-match", **RESIDUAL)
-    return fitted(method, takes_data, takes_data.windows("train"), out=out, seed=seed, **training).model.eval()
+    return fit_or_load(method, takes_data, takes_data.windows("train"), out=out, seed=seed, **training).model.eval()
 
 
 def protocol(fps: float) -> motion.Protocol:
@@ -333,7 +333,7 @@ def reference_errors(run: EvaluatedRun, model: Any) -> dict[str, Any]:
         for name, ahead in ((SUP, predicted), (STILL, still)):
             surfaces = torch.cat([truth[:observed], ahead])
             errors[name].append(bodies.vertex_error(surfaces[:, None], truth[:, None]))
-    return scored(run, {name: by_times(times, rows) for name, rows in errors.items()}, times=times)
+    return scores_by_take(run, {name: by_times(times, rows) for name, rows in errors.items()}, times=times)
 
 
 def measure_references(run: EvaluatedRun, seed: int, out: Path) -> dict[str, Any]:
@@ -364,7 +364,7 @@ def measure_completion(run: EvaluatedRun, sight: Sight) -> dict[str, Any]:
             distances["seen"].append(chamfer(observations["points"][one], predicted[:, frames]).mean(-1))
     lasts = model.timed.lasts(completed.x) - model.timed.lasts(batch[WHOLE])
     scores = {name: millimetres(torch.cat(each)) for name, each in distances.items() if each}
-    return scored(run, {OURS: {**scores, "duration": millimetres(lasts.abs()), **convergence(completed)}})
+    return scores_by_take(run, {OURS: {**scores, "duration": millimetres(lasts.abs()), **convergence(completed)}})
 
 
 def convergence(completed: Completed) -> dict[str, Any]:
@@ -419,7 +419,7 @@ def measure_coverage(
         for level, share in zip(LEVELS, torch.stack(each, 1), strict=True)
     }
     vertices = millimetres(bodies.vertex_error(predicted, true_surfaces))
-    return scored(
+    return scores_by_take(
         run,
         {OURS: {"khat": khat.tolist(), "vertices": vertices, **deviations_mm, **coverages, **convergence(completed)}},
     )

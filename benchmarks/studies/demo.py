@@ -56,7 +56,7 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         method = dvae.method(name, latent=8, scheduled_sampling=1.0, warm_up=steps // 3, **loss)
         print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
         training = dvae.Training(steps=steps, batch_size=32, learning_rate=RATES[name], decay=0.5)
-        result = fitted(method, data, run, training)
+        result = fit_or_resume(method, data, run, training)
         print(result.best)
 
     models = {name: dvae.load(run).model for name, run in runs.items()}
@@ -87,7 +87,7 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         raise SystemExit("the report failed")
 
 
-def fitted(method: Trainable, data: Dataset, run: Path, training: dvae.Training) -> Fit:
+def fit_or_resume(method: Trainable, data: Dataset, run: Path, training: dvae.Training) -> Fit:
     """Fit a method, or continue a run that was interrupted."""
     if Run(run).exists:
         before = read_config(run)

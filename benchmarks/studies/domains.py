@@ -25,7 +25,7 @@ from dvae.tables.domains import speech
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 
-from .engine import OURS, Row, cell, fitted, measure, read, scores_of, settings
+from .engine import OURS, Row, cell, fit_or_load, measure, read, scores_of, settings
 from .results import Table, ordered, tabled, write
 
 FORECASTS = 100
@@ -207,7 +207,7 @@ def run(data: Data, part: str, case: str, seed: int, out: Path) -> dict[str, Any
     training = {**section.training, **options.get("training", {})}
     windows, validation = training_data.windows("train"), training_data.windows("validation")
     source = Alike(windows) if "lengths" in windows.all() else windows
-    fit = fitted(method, training_data, source, validation, out=out, seed=seed, **training)
+    fit = fit_or_load(method, training_data, source, validation, out=out, seed=seed, **training)
     model = fit.model.eval()
     weights = sum(parameter.numel() for parameter in model.parameters())
     measurement = {"seconds": fit.processor_seconds, "parameters": weights, **measured(model, case, data, part, seed)}

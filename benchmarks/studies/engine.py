@@ -78,7 +78,7 @@ def measure(
         read_or_measure(out / file, partial(run, case, seed, out))
 
 
-def fitted(
+def fit_or_load(
     method: Any, data: Any, train: Any, validation: Any = None, *, out: Path, seed: int, steps: int, **options: Any
 ) -> Fit:
     """Fit a method, resume its run, or load the finished run.
@@ -100,7 +100,7 @@ def fitted(
     return dvae.fit(model, recipe, out=out, **run_options, **options)
 
 
-def swept(
+def sweep_seeds(
     row: str, method: Any, data: Any, runs: Path, seeds: Sequence[int], training: Any, jobs: int = 1
 ) -> list[Path]:
     """Return the run directories of a method, one per seed; missing runs are fitted.

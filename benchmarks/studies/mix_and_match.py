@@ -31,7 +31,7 @@ from dvae.models.motion.codes import CodeDiversity, code_diversity
 from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.metric_models.quality import STILL, RealOrGenerated, quality
 
-from .engine import OURS, Row, budget, fitted, folder, measure, read, scores_of, settings, spread
+from .engine import OURS, Row, budget, fit_or_load, folder, measure, read, scores_of, settings, spread
 from .results import DOCS, Table, tabled, write
 
 OPTIONS: dict[str, Any] = {"width": 128, "scale": 0.01}
@@ -125,7 +125,7 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
     past = test.all().past(test.protocol.observed).rows(some)
     watch = CodeDiversity(past, every=max(steps // 15, 1))
     training = {**TRAINING, "steps": steps, "validate_every": max(steps // 3, 1), "callbacks": [watch]}
-    fit = fitted(method, data, train, out=out, seed=seed, **training)
+    fit = fit_or_load(method, data, train, out=out, seed=seed, **training)
     model, (watched, diversity) = fit.model.eval(), fit.series("codes/diversity")
     late = [row["kl/z"] for row in fit.history if "kl/z" in row and row["step"] > 0.9 * steps]
 

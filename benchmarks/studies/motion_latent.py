@@ -24,7 +24,7 @@ from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
-from .engine import OURS, Row, budget, fitted, folder, interval, measure, read, settings
+from .engine import OURS, Row, budget, fit_or_load, folder, interval, measure, read, settings
 from .results import Table, tabled, write
 
 TUNING, HELD = "tuning", "held out"
@@ -95,7 +95,7 @@ def run(section: str, file: Path, other: Path | None, steps: int, case: str, see
     options = SECTIONS[section][case]
     data = segments(section, file, **options.get("data", {}))
     train, method = data.windows("train"), dvae.method("motion-latent", **options.get("method", {}))
-    fit = fitted(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **TRAINING)
+    fit = fit_or_load(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **TRAINING)
     tests = {SAME: data.windows("test")}
     if other is not None and section == HELD:
         tests[OTHER] = elsewhere(other, data.timed)

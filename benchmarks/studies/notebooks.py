@@ -102,7 +102,7 @@ def check(path: Path, on: KernelManager) -> None:
     code = ([cell for cell in each.cells if cell.cell_type == "code"] for each in (stored, run))
     for before, now in zip(*code, strict=True):
         assert reproducible_outputs(before) == reproducible_outputs(now), (
-            f"{now.source}\n\nshows other things than are stored; run `make notebooks`"
+            f"{now.source}\n\noutputs differ from the stored ones; run `make notebooks`"
         )
 
 

@@ -88,7 +88,7 @@ def cells(means: np.ndarray, weights: np.ndarray) -> list[str]:
     return formatted
 
 
-def fitted(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
+def fit_method(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
     """Fit a method to the observed entries."""
     train = data.windows("train")
     torch.manual_seed(seed)
@@ -146,7 +146,7 @@ def main(
     for name in METHODS:
         for seed in range(seeds):
             start = time.process_time()
-            model = fitted(name, dataset, max(round(steps * STEPS[name]), 1), seed)
+            model = fit_method(name, dataset, max(round(steps * STEPS[name]), 1), seed)
             print(f"{name}, seed {seed}: fitted in {time.process_time() - start:.0f} s of processor time", flush=True)
             mean, spread = imputed(model, batch, samples, seed)
             errors_by_method.setdefault(name, []).append(errors(mean))

@@ -37,8 +37,8 @@ from .ranking import (
     Accelerator,
     View,
     entries,
-    titled,
-    trained,
+    row_label,
+    training_cells,
     work,
 )
 from .results import DOCS, Table, refuse_unknown, write
@@ -116,7 +116,7 @@ class Paper:
         return list(dict.fromkeys([*self.views, *(view for each in self.further for view in each.views_of(row))]))
 
 
-def further(
+def read_further(
     views: Sequence[Mapping[str, Any]],
     printed: str = "",
     apart: Mapping[str, Any] = MappingProxyType({}),
@@ -132,7 +132,7 @@ def paper(name: str, fields: Mapping[str, Any]) -> Paper:
     rows = {row: {**(FUTURES | PATHS).get(row, {}), **options} for row, options in fields["rows"].items()}
     views = {
         "views": [View(**view) for view in fields["views"]],
-        "further": [further(**each) for each in fields["further"]],
+        "further": [read_further(**each) for each in fields["further"]],
     }
     return Paper(printed=PUBLISHED[name], **{**fields, **views, "rows": rows})
 
@@ -158,7 +158,9 @@ def scores(
             entry = rows_by_view[view][row]
             has_value = entry.trained or condition != "given"
             value = [str(vars(view)[condition]) if has_value else ""] if condition else []
-            lines.append([titled(row, entry), *value, *trained(entry), *map(cell, map(entry.estimate, columns))])
+            lines.append(
+                [row_label(row, entry), *value, *training_cells(entry), *map(cell, map(entry.estimate, columns))]
+            )
     for row, cells in published_rows.items():
         if all(cells.get(column, "–") == "–" for column in columns):
             continue
@@ -213,7 +215,7 @@ PATHED = ("ADE", "FDE", "energy score")
 
 
 @styled
-def drawn(rows_by_view: RowsByView, paper: Paper) -> Figure:
+def draw_scores(rows_by_view: RowsByView, paper: Paper) -> Figure:
     """Draw scores by number of given paths, over the seeds with all of them; intervals are over clips and seeds."""
     figure = new_figure(7, 2.9)
     for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
@@ -280,7 +282,7 @@ def main(
             if results is not None:
                 more = (view for each in paper.further for view in each.views if view == View(view.given))
                 more_rows = {view: entries(stored, paper.set, view, paper.rows) for view in more}
-                drawn(rows_by_view | more_rows, paper).savefig(pictures / f"{name}.png", dpi=200)
+                draw_scores(rows_by_view | more_rows, paper).savefig(pictures / f"{name}.png", dpi=200)
         for each in paper.further:
             more_rows = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
             for called, (row, view) in each.apart.items():

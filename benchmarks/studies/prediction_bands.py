@@ -60,8 +60,8 @@ class Scored:
         distances = torch.cat(
             [standardised(forecasts, true, forecasts.std(1) if spread is None else spread) for forecasts, true in parts]
         )
-        far = {region: largest_by_region(torch.cat(distances), region) for region in REGIONS}
-        return cls(far, clip_index(windows.keys), np.array(windows.labels("style")))
+        by_region = {region: largest_by_region(torch.cat(distances), region) for region in REGIONS}
+        return cls(by_region, clip_index(windows.keys), np.array(windows.labels("style")))
 
     def coverage(self, region: str, calibration: np.ndarray, test: np.ndarray) -> float:
         """Return the mean share over test clips of windows inside the bands of the calibration windows."""

@@ -36,7 +36,7 @@ from dvae.motion.data.dataset import MotionData
 from dvae.motion.geometry.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 
-from .engine import Archive, Row, cell, folder, settings, swept
+from .engine import Archive, Row, cell, folder, settings, sweep_seeds
 from .results import DOCS, Table, refuse_unknown, require_gpu, same, write
 
 SCORES = Path(__file__).parents[1] / "scores"
@@ -155,7 +155,7 @@ LEVEL = 0.9
 """Level of intervals and of the model confidence set."""
 
 
-def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
+def stored_part(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
     """Return the stored part of an evaluation: scores by clip of a run, or of all reference rows.
 
     Returns:
@@ -184,8 +184,8 @@ def fitted_metric_models(data: MotionData, runs: Path, names: Sequence[str] = ("
     """Fit missing metric models to the training clips, and return the run directories of all."""
     for name in names:
         method, options, training = METRIC_MODELS[name]
-        clips = grouped(data) if options.get("label") == "group" else data
-        (metric_model,) = swept(
+        clips = with_groups(data) if options.get("label") == "group" else data
+        (metric_model,) = sweep_seeds(
             name, registry.metric_models()[method](**options), clips, runs / "metric_models", (0,), training
         )
         config = metric_model / "config.json"  # stored in the repository, without paths of this machine
@@ -196,7 +196,7 @@ def fitted_metric_models(data: MotionData, runs: Path, names: Sequence[str] = ("
     return {name: runs / "metric_models" / f"{name}-seed0" for name in names}
 
 
-def grouped(data: MotionData) -> MotionData:
+def with_groups(data: MotionData) -> MotionData:
     """Return clips with a label for the group of their content, such as all kinds of walks."""
     labels = [{**clip.labels, "group": clip.labels["content"].split("-")[0]} for clip in data.motion]
     clips = [replace(clip, labels=each) for clip, each in zip(data.motion, labels, strict=True)]
@@ -230,7 +230,7 @@ def fit(
         method_options["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
         method_options["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
-    (path,) = swept(row, dvae.method(method, **method_options), data, runs, (seed,), training)
+    (path,) = sweep_seeds(row, dvae.method(method, **method_options), data, runs, (seed,), training)
     return path
 
 
@@ -277,7 +277,7 @@ def work(
     def score(path: Path | None, row: str, view: View) -> dict[str, Any]:
         data, by = dataset, metric_models
         if view.metric_models:
-            data, by = grouped(dataset), fitted_metric_models(dataset, stored / like, view.metric_models.split("+"))
+            data, by = with_groups(dataset), fitted_metric_models(dataset, stored / like, view.metric_models.split("+"))
         elif view.observed:  # a pose prior reads windows rotated at the last observed frame of its own protocol
             by = {metric_model: run for metric_model, run in metric_models.items() if metric_model != "prior"}
         models = {} if path is None else {row: load(path).model.to(accelerator)}
@@ -291,7 +291,9 @@ def work(
             }
             models = {name: wrappers.get(view.parts, lambda free: free)(model) for name, model in models.items()}
         scores = diversities if view.parts else motion_scores(by)
-        return scored(dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **options_of_view), path)
+        return stored_part(
+            dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **options_of_view), path
+        )
 
     references = archive(stored, like)
     for view in dict.fromkeys(view for each in views.values() for view in each):
@@ -387,7 +389,7 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
         if members := fnmatch.filter(names, view.member(f"{folder(row)}-seed*")):
             runs = store.read(members)
             basis = basis or runs[0]["basis"]
-            if any(alike(each["basis"]) != alike(basis) for each in runs):
+            if any(comparable_basis(each["basis"]) != comparable_basis(basis) for each in runs):
                 raise ValueError(
                     f"scores of {row} in {store.file} differ from the others in windows, samples, seed or metric models"
                 )
@@ -405,12 +407,12 @@ EMISSION = 3
 """Position in a basis of the kind of forecasts: means or draws."""
 
 
-def alike(basis: Sequence[Any]) -> list[Any]:
+def comparable_basis(basis: Sequence[Any]) -> list[Any]:
     """Return the entries of a basis that the rows of a table must share: all except the kind of forecasts."""
     return [*basis[:EMISSION], *basis[EMISSION + 1 :]]
 
 
-def titled(name: str, entry: Row) -> str:
+def row_label(name: str, entry: Row) -> str:
     """Return the label of a row, with the options that distinguish it."""
     first = entry.runs[0]
     modes = first["config"].get("method", {}).get("modes")
@@ -421,7 +423,7 @@ def titled(name: str, entry: Row) -> str:
 TRAINED = ("seeds", "CPU minutes")
 
 
-def trained(entry: Row) -> tuple[str, str]:
+def training_cells(entry: Row) -> tuple[str, str]:
     """Return the number of seeds and the mean minutes of the fits on a CPU."""
     if not entry.trained:
         return "–", "–"
@@ -429,7 +431,7 @@ def trained(entry: Row) -> tuple[str, str]:
     return str(len(entry.runs)), f"{statistics.fmean(here):.1f}" if here else "GPU"
 
 
-def ranked(rows: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
+def rank_by_energy(rows: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
     """Return the energy scores of all rows except real motion, best first."""
     scores = {name: entry.two_way_errors(RANKED) for name, entry in rows.items() if name != "real motion"}
     complete = {name: score for name, score in scores.items() if score is not None}  # every motion method has the score
@@ -441,14 +443,14 @@ def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> Table:
 
     The note is the model confidence set.
     """
-    scores = ranked(rows)
+    scores = rank_by_energy(rows)
     header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
     lines = []
     for name, above in zip(scores, [None, *scores], strict=False):
         row = rows[name]
         minus = [None if name == NEIGHBOURS else NEIGHBOURS, above]
         behind = [None if other is None else scores[name].estimate(scores[other]) for other in minus]
-        lines.append([titled(name, row), *trained(row), *map(cell, [*behind, *map(row.estimate, columns)])])
+        lines.append([row_label(name, row), *training_cells(row), *map(cell, [*behind, *map(row.estimate, columns)])])
     tested = {name: score for name, score in scores.items() if score.count >= ENOUGH}
     if not any(rows[name].trained for name in tested):
         return Table(header, lines)
@@ -457,9 +459,9 @@ def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> Table:
 
 
 @styled
-def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
+def draw_ranking(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
     """Draw the energy scores minus the neighbours' for each set; all panels use the row order of the first."""
-    ranks = {name: ranked(rows_of_set) for name, rows_of_set in sets.items()}
+    ranks = {name: rank_by_energy(rows_of_set) for name, rows_of_set in sets.items()}
     order = list(dict.fromkeys(row for scores in ranks.values() for row in scores if row != NEIGHBOURS))
     columns = min(2, len(sets))
     rows = math.ceil(len(sets) / columns)
@@ -534,7 +536,7 @@ def main(
     sought = {name: rows_of(scores, name, View()) for name, selected in SETS.items() if View() in selected.views}
     futures = {name: rows for name, rows in sought.items() if rows}
     if results is not None and futures:
-        drawn(futures).savefig(picture, dpi=200)
+        draw_ranking(futures).savefig(picture, dpi=200)
 
 
 if __name__ == "__main__":

@@ -107,7 +107,7 @@ def main(
     """
     rows = []
     for name, text in GUIDES.items():
-        model, _ = bounds.fitted(text, steps, 300, scale=0.9)
+        model, _ = bounds.fit_best_guide(text, steps, 300, scale=0.9)
         rows.append([f"`{text}`, {name}", *diagnostic_cells(model, model.sample(sequences, steps)["x"])])
     write(results, {"criticism/reference": Table(["best guide", *COLUMNS], rows)})
     guides = ["the posterior, 500 draws", "mean-field, 100 draws", "500 draws", "z_T too narrow, 500 draws"]

@@ -80,7 +80,7 @@ def require_gpu(option: str) -> None:
     """End the script if an option asks for a GPU and torch finds none."""
     if not torch.cuda.is_available():
         built = "" if torch.version.cuda else ", as it is built without CUDA"
-        sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or take a machine with one")
+        sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or use a machine with a GPU")
 
 
 def loaded(run: Path) -> Any:

@@ -26,7 +26,7 @@ from dvae.motion.data.dataset import MotionData
 from dvae.motion.scoring.energies import pose_prior_energy
 from dvae.runs.directory import load
 
-from .engine import settings, swept
+from .engine import settings, sweep_seeds
 from .ranking import JOINTS, METRIC_MODELS, SCORES, SETS, entries, fitted_metric_models, motion_scores, split_options
 from .results import Table, refuse_unknown, tabled, write
 
@@ -137,7 +137,9 @@ def of_metric_models(data: MotionData, runs: Path, store: Store) -> None:
         method, options, training = METRIC_MODELS[name]
         for seed in [seed for seed in SEEDS_OF[name] if store.is_missing(row, seed)]:
             training_options = replace(training, steps=int(steps))
-            (path,) = swept(row, registry.metric_models()[method](**options), data, runs, (seed,), training_options)
+            (path,) = sweep_seeds(
+                row, registry.metric_models()[method](**options), data, runs, (seed,), training_options
+            )
             store.add(row, seed, of_metric_model(name, path, selection_windows(data)))
 
 
@@ -243,7 +245,7 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
         for case in section.cases:
             if seeds := [seed for seed in section.seeds if store.is_missing(case, seed)]:
                 method, training = section.of(case, prior)
-                paths = swept(case, method, data_set, runs / name, seeds, training, jobs)
+                paths = sweep_seeds(case, method, data_set, runs / name, seeds, training, jobs)
                 for seed, path in zip(seeds, paths, strict=True):
                     store.add(case, seed, score(path, data_set, metric_models))
 

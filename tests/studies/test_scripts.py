@@ -252,7 +252,7 @@ def short(monkeypatch):
     """Shorten completion: simulated people, small options, a horizon of half a second."""
     few = motion.simulate(clips=10, frames=90, seed=1)
     monkeypatch.setattr(dataset, "simulate", lambda: few)
-    monkeypatch.setattr(completion, "grouped", lambda people: people)
+    monkeypatch.setattr(completion, "split_by_group", lambda people: people)
     for name, value in {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}.items():
         monkeypatch.setattr(completion, name, value)
     for name, value in {
@@ -506,7 +506,7 @@ def test_minutes_are_means_over_fits_on_a_cpu():
         runs = [
             {"minutes": n, "config": {"training": {"accelerator": accelerator}}} for accelerator, n in minutes.items()
         ]
-        return ranking.trained(engine.Row(runs))
+        return ranking.training_cells(engine.Row(runs))
 
     assert cells(auto=4.0, cuda=1.0) == ("2", "4.0")
     assert cells(auto=4.0, cpu=6.0) == ("2", "5.0")
@@ -583,7 +583,7 @@ def test_groups_are_of_the_first_word():
     people = motion.simulate(clips=2, frames=80, seed=1)
     contents = ("walk-turn-left", "run")
     clips = [replace(clip, labels={"content": name}) for clip, name in zip(people, contents, strict=True)]
-    data = ranking.grouped(
+    data = ranking.with_groups(
         motion.MotionData("", motion.MotionSet(clips, people.skeleton), motion.PROTOCOLS["simulated"])
     )
     assert [clip.labels["group"] for clip in data.motion] == ["walk", "run"]
@@ -663,7 +663,7 @@ def test_papers(folder, out, monkeypatch):
     assert single[1][4].startswith("0.000")  # one motion has no diversity
     assert (folder / "page.png").stat().st_size > 0
     rows_by_view = {view: ranking.entries(folder / "scores", paper.set, view, paper.rows) for view in paper.views}
-    errors, *_ = papers.drawn(rows_by_view, paper).axes
+    errors, *_ = papers.draw_scores(rows_by_view, paper).axes
     for row, line in zip(paper.rows, (line for line in errors.lines if line.get_marker() == "o"), strict=True):
         assert [*line.get_xdata()] == [0, 1]
         assert line.get_ydata() == pytest.approx([ades[row, count] for count in "01"], abs=0.0006)
