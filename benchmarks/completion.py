@@ -22,7 +22,7 @@ from dvae.motion import bodies
 from dvae.motion.segments.completion import complete, simulate_observations
 from dvae.motion.segments.embodied import Segments
 
-from .speed import moved, stopwatch
+from .speed import stopwatch, to_device
 
 MANY, STEPS = 100, 101
 TARGETS = {
@@ -39,7 +39,7 @@ def rows(device: torch.device) -> dict[str, float]:
     model, batch = MotionLatent().build(segments).eval(), segments.all()
     rows = list(islice(cycle(range(len(segments))), MANY))
     x, shape = batch["x"][rows], batch["beta"][rows]
-    observations = moved(simulate_observations(model, x, shape, "markers", frames=range(0, 100, 20)), device)
+    observations = to_device(simulate_observations(model, x, shape, "markers", frames=range(0, 100, 20)), device)
     model.to(device)
 
     clock = stopwatch()

@@ -42,7 +42,7 @@ def blocks(frames: int, size: int = FEW) -> Iterator[np.ndarray]:
         yield np.cumsum(rng.standard_normal((size, SIZE), np.float32), 0) / 100
 
 
-def written(path: Path, frames: int) -> Path:
+def write_frames(path: Path, frames: int) -> Path:
     """Write an npy file of frames."""
     with path.open("wb") as file:
         header = {"descr": "<f4", "fortran_order": False, "shape": (frames, SIZE)}
@@ -52,7 +52,7 @@ def written(path: Path, frames: int) -> Path:
     return path
 
 
-def walked(path: Path, frames: int) -> Path:
+def write_walks(path: Path, frames: int) -> Path:
     """Write an archive of 100 clips with so many frames in all, in its own folder."""
     path.parent.mkdir()
     [walk] = motion.simulate(1, FEW, seed=0)
@@ -74,7 +74,7 @@ def anonymous(process: int) -> int:
     return next((1024 * int(line.split()[1]) for line in lines if line.startswith("RssAnon:")), 0)
 
 
-def most(data: Path, *options: str) -> int:
+def peak_memory(data: Path, *options: str) -> int:
     """Return the peak anonymous memory of a fit to a file, in bytes."""
     with tempfile.TemporaryDirectory() as out:
         command = [sys.executable, "-m", "dvae.cli", "fit", "srnn", "--data", str(data), "--out", f"{out}/run"]
@@ -110,8 +110,8 @@ def rows(_: torch.device) -> dict[str, float]:
         folder = Path(name)
         if shutil.disk_usage(folder).free < 2.5e9:
             raise SystemExit(f"{folder} has less than 2.5 GB of free space; set TMPDIR to a folder with more")
-        many, few = written(folder / "many.npy", FRAMES), written(folder / "few.npy", FEW)
-        ratios = {"memory": most(many, *cut) / most(few, *cut), **steps(many)}
+        many, few = write_frames(folder / "many.npy", FRAMES), write_frames(folder / "few.npy", FEW)
+        ratios = {"memory": peak_memory(many, *cut) / peak_memory(few, *cut), **steps(many)}
         many.unlink()
-        walks = [most(walked(folder / str(frames) / "walks.npz", frames)) for frames in (FRAMES, FEW)]
+        walks = [peak_memory(write_walks(folder / str(frames) / "walks.npz", frames)) for frames in (FRAMES, FEW)]
     return ratios | {"memory, motion": walks[0] / walks[1]}

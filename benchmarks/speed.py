@@ -88,7 +88,7 @@ def stopwatch() -> Callable[[], float]:
     return clock
 
 
-def moved(batch: Any, device: torch.device) -> Any:
+def to_device(batch: Any, device: torch.device) -> Any:
     """Move a batch to a device."""
     return batch.map(lambda value: value.to(device))
 
@@ -187,7 +187,7 @@ def step_of(model: Any, x: Tensor) -> Callable[[], None]:
 def fed_step(method: Any, model: Any, windows: Any, size: int, device: torch.device, **program: Any) -> Any:
     """Return a training step of a method on a batch of windows, and the function that draws batches."""
     recipe, elbo, generator = method.train(windows), dvae.SequenceELBO(), torch.Generator().manual_seed(0)
-    draw = lambda: moved(recipe.batches.sample(size, generator), device)  # noqa: E731
+    draw = lambda: to_device(recipe.batches.sample(size, generator), device)  # noqa: E731
     return training_step(model, lambda: recipe.objective(elbo.terms(model, draw(), **program), 0)), draw
 
 

@@ -19,7 +19,7 @@ from .results import Table, loaded, write
 SETTINGS: dict[str, Any] = {"particles": 32, "temperatures": 20, "chains": 4}
 
 
-def known(name: str, inference: str, steps: int, count: int, fitting: int) -> list[str]:
+def known_row(name: str, inference: str, steps: int, count: int, fitting: int) -> list[str]:
     """Return the parts of the gap and the width of the bracket, for the best guide and data from the model."""
     model, oracle = fit_best_guide(inference, steps, 300)
     x = model.sample(count, steps)["x"]
@@ -39,7 +39,7 @@ def known(name: str, inference: str, steps: int, count: int, fitting: int) -> li
     ]
 
 
-def bracketed(run: Path, folder: Path, count: int, fitting: int, reach: int) -> dvae.Bracket:
+def load_or_compute(run: Path, folder: Path, count: int, fitting: int, reach: int) -> dvae.Bracket:
     """Compute the bracket of some test windows of a run, or load the stored one."""
     path = folder / f"{run.name}.json"
     if not path.is_file():
@@ -84,9 +84,9 @@ def main(
     torch.set_num_threads(1)
     kept.mkdir(parents=True, exist_ok=True)
     parts = ["amortisation", "missing edges", "family"]
-    rows = [known(name, inference, steps, count, fitting) for name, inference in GUIDES.items()]
+    rows = [known_row(name, inference, steps, count, fitting) for name, inference in GUIDES.items()]
     write(results, {"bounds/parts": Table(["", "evidence - ELBO", *parts, "AIS - evidence", "upper - AIS"], rows)})
-    rows = [row(run.name, bracketed(run, kept, count, fitting, reach)) for run in runs]
+    rows = [row(run.name, load_or_compute(run, kept, count, fitting, reach)) for run in runs]
     columns = ["", "IWAE", "FIVO", "AIS", *parts, "upper - AIS, simulated"]
     write(results, {"bounds/runs": Table(columns, rows)})
 

@@ -146,11 +146,11 @@ SIGHTS = {
     "frames": [Sight(FEW, frames, markers) for frames in FRAMES for markers in (False, True)],
     "markers": [Sight(0, frames, True) for frames in FRAMES],
 }
-SURE = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
+UNCERTAINTY_CASES = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
 """Observations for the coverage of intervals and for the tuning of deviations, one of each kind."""
-TRIED = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02, 0.05, 0.1)}
-TRIED |= {"point": (0.05, 0.1, 0.2)}
-KINDS = dict(zip(map(str, SURE), ("surface", "marker", "point"), strict=True))
+TUNED_DEVIATIONS = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02, 0.05, 0.1)}
+TUNED_DEVIATIONS |= {"point": (0.05, 0.1, 0.2)}
+KINDS = dict(zip(map(str, UNCERTAINTY_CASES), ("surface", "marker", "point"), strict=True))
 PRIORS = {"aggregate": True, "standard": False}
 """Whether the prior is the aggregate posterior of training segments, by name; otherwise it is N(0, I)."""
 DESCENTS = [dvae.Descent(100, 0.05, 1), dvae.Descent(100, 0.05), dvae.Descent(100, 0.1), dvae.Descent(200, 0.05)]
@@ -238,7 +238,7 @@ def millimetres(values: Tensor) -> list[Any]:
 # Prediction
 
 
-def moments(fps: float) -> tuple[list[float], int]:
+def observed_times(fps: float) -> tuple[list[float], int]:
     """Return the times of the frames up to the horizon, and the number of observed frames."""
     return [n / fps for n in range(int(HORIZON * fps + 1e-3) + 1)], int(SECONDS * fps + 1e-3) + 1
 
@@ -248,7 +248,7 @@ def at(time: float) -> str:
     return f"{time:.3f} s"
 
 
-def by_times(times: Sequence[float], segment_errors: Sequence[Tensor]) -> dict[str, list[Any]]:
+def errors_by_time(times: Sequence[float], segment_errors: Sequence[Tensor]) -> dict[str, list[Any]]:
     """Arrange errors (T,) of each segment by time and segment; NaN marks times after the end."""
     return dict(zip(map(at, times), millimetres(torch.stack([*segment_errors], 1)), strict=True))
 
@@ -257,13 +257,13 @@ def errors_of(run: EvaluatedRun, predicted: tuple[Tensor, Tensor], times: Sequen
     """Return errors by time and segment of predicted frames and body shapes."""
     truth = run.batch[WHOLE], run.batch[SHAPE]
     pairs = [[tuple(each[n : n + 1] for each in side) for side in (predicted, truth)] for n in range(len(predicted[0]))]
-    return by_times(times, [error_by_time(run.model, *pair, times)[0] for pair in pairs])
+    return errors_by_time(times, [error_by_time(run.model, *pair, times)[0] for pair in pairs])
 
 
 def measure_prediction(run: EvaluatedRun) -> dict[str, Any]:
     """Return errors by time of predictions and of reconstructions of whole segments."""
     model, batch = run.model, run.batch
-    times, _ = moments(run.segments.motion.skeleton.fps)
+    times, _ = observed_times(run.segments.motion.skeleton.fps)
     rows = {}
     for name, sight in ((OURS, Beginning()), (BODY_UNKNOWN, Beginning(with_shape=False))):
         completed = run.complete(sight.of(model, batch), DEVIATIONS, DESCENT)
@@ -288,7 +288,7 @@ def fit_residual(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
 
 def protocol(fps: float) -> motion.Protocol:
     """Return the protocol of windows up to the horizon, rotated to face ahead in the last observed frame."""
-    times, observed = moments(fps)
+    times, observed = observed_times(fps)
     options: dict[str, Any] = {"root": "relative", "heading": True, "representation": "quaternion", "validation": 0.0}
     return motion.Protocol(SUP, observed, len(times) - observed, fps, train_stride=1, test_stride=100_000, **options)
 
@@ -322,7 +322,7 @@ def residual_poses(model: Any, people: motion.MotionSet) -> tuple[Tensor, Tensor
 def reference_errors(run: EvaluatedRun, model: Any) -> dict[str, Any]:
     """Return errors by time of residual-sup and of the repeated last observed frame."""
     batch, people = run.batch, run.segments.motion
-    times, observed = moments(people.skeleton.fps)
+    times, observed = observed_times(people.skeleton.fps)
     errors: dict[str, list[Any]] = {SUP: [], STILL: []}
     rotations, places = residual_poses(model, people)
     for n in range(len(people)):
@@ -333,7 +333,7 @@ def reference_errors(run: EvaluatedRun, model: Any) -> dict[str, Any]:
         for name, ahead in ((SUP, predicted), (STILL, still)):
             surfaces = torch.cat([truth[:observed], ahead])
             errors[name].append(bodies.vertex_error(surfaces[:, None], truth[:, None]))
-    return scores_by_take(run, {name: by_times(times, rows) for name, rows in errors.items()}, times=times)
+    return scores_by_take(run, {name: errors_by_time(times, rows) for name, rows in errors.items()}, times=times)
 
 
 def measure_references(run: EvaluatedRun, seed: int, out: Path) -> dict[str, Any]:
@@ -433,14 +433,14 @@ def coverage_name(quantity: str, level: float) -> str:
 # Tables
 
 
-def curves(out: Path) -> dict[str, Row]:
+def error_rows(out: Path) -> dict[str, Row]:
     """Return the rows with errors by time."""
     ours, others = (read_all(out, name) for name in ("prediction", "references"))
     rows = {OURS: ours, BODY_UNKNOWN: ours, NEAR: ours, SUP: others, STILL: others}
     return {name: replace(row, name=name) for name, row in rows.items() if row is not None}
 
 
-def by_time(rows: Mapping[str, Row]) -> Table:
+def time_table(rows: Mapping[str, Row]) -> Table:
     """Return a table of errors by row and tenth of a second, with the difference to residual-sup."""
     first = next(iter(rows.values()))
     times = [time for time in first.runs[0]["times"] if time > SECONDS and abs(10 * time - round(10 * time)) < 1e-3]
@@ -504,12 +504,12 @@ def coverage_table(rows: Mapping[Any, Row], levels: Sequence[float] = LEVELS) ->
 def tables(out: Path) -> dict[str, Table]:
     """Return all available tables."""
     available = {}
-    if error_curves := curves(out):
-        available["prediction"] = by_time(error_curves)
+    if error_curves := error_rows(out):
+        available["prediction"] = time_table(error_curves)
     for across, sights in SIGHTS.items():
         if completed := of_sights(out, sights):
             available[f"completion-{across}"] = completions(completed)
-    if sure := of_sights(out, SURE, "sure of {}"):
+    if sure := of_sights(out, UNCERTAINTY_CASES, "sure of {}"):
         available["completion-uncertainty"] = coverage_table(sure)
     if tuning := of_sights(out, tuning_settings()):
         available["completion-tuning"] = coverage_table(tuning, levels=LEVELS[1:2])
@@ -519,7 +519,7 @@ def tables(out: Path) -> dict[str, Table]:
 @styled
 def draw(out: Path, file: Path) -> None:
     """Draw errors over time and box plots over segments by points and by frames (figures 6 and 7 of the paper)."""
-    error_curves, completed = curves(out), of_sights(out, [sight for sights in SIGHTS.values() for sight in sights])
+    error_curves, completed = error_rows(out), of_sights(out, [sight for sights in SIGHTS.values() for sight in sights])
     if not error_curves and not completed:
         return
     figure = new_figure(7, 2.6)
@@ -569,9 +569,9 @@ def draw(out: Path, file: Path) -> None:
 def tuning_settings() -> dict[str, tuple[Any, Deviations, dvae.Descent, bool]]:
     """Return the tuning settings by name: observation, deviations, descent, and whether the prior uses segments."""
     settings: dict[str, tuple[Any, Deviations, dvae.Descent, bool]] = {}
-    for sight in SURE:
+    for sight in UNCERTAINTY_CASES:
         kind = KINDS[str(sight)]
-        for value, (prior, aggregate) in itertools.product(TRIED[kind], PRIORS.items()):
+        for value, (prior, aggregate) in itertools.product(TUNED_DEVIATIONS[kind], PRIORS.items()):
             options = replace(DEVIATIONS, **{kind: value}), DESCENT, aggregate
             settings[f"{sight}, {prior} prior, {kind} {value:g}"] = sight, *options
         for descent in DESCENTS:
@@ -612,7 +612,7 @@ def main(
         completed = replace(predicted, some=True)
         for sight in dict.fromkeys(itertools.chain(*SIGHTS.values())) if "completion" in parts else ():
             read_or_measure(here / f"{folder(sight)}.json", partial(measure_completion, completed, sight))
-        for sight in SURE if "uncertainty" in parts else ():
+        for sight in UNCERTAINTY_CASES if "uncertainty" in parts else ():
             read_or_measure(
                 here / f"{folder(f'sure of {sight}')}.json",
                 partial(measure_coverage, completed, sight, DEVIATIONS, DESCENT),

@@ -30,7 +30,7 @@ from .results import Table, ordered, tabled, write
 
 FORECASTS = 100
 BASELINE = "autoregressive"
-AT_ONCE, HELD = 2**14, 2**17
+AT_ONCE, PARTICLES_AT_ONCE = 2**14, 2**17
 """Largest number of steps in a batch, with padding, and of steps times particles in memory."""
 BOUND, ELBO, FIVO, SDR, KHAT = "IWAE bound", "ELBO", "FIVO", "SI-SDR", "k-hat"
 UNFILTERED = ("rvae-noncausal",)
@@ -111,7 +111,7 @@ class Data:
         return speech.recordings()
 
 
-class Alike:
+class SimilarLengths:
     """Draw batches of sequences with similar lengths, to reduce padding; all sequences are equally likely."""
 
     def __init__(self, windows: Any):
@@ -128,17 +128,17 @@ class Alike:
         lengths = self.batch["lengths"]
         order = (lengths.log() + 0.2 * torch.randn(len(lengths), generator=generator)).argsort()
         start = int(torch.randint(1 - batch_size, len(order), (), generator=generator))
-        return trimmed(self.batch, order[max(start, 0) : start + batch_size])
+        return trim_padding(self.batch, order[max(start, 0) : start + batch_size])
 
 
-def trimmed(batch: Mapping[str, Any], some: Tensor) -> dict[str, Any]:
+def trim_padding(batch: Mapping[str, Any], some: Tensor) -> dict[str, Any]:
     """Return rows of a batch, without the steps that are padding in all of them."""
     part = dict(batch.map(lambda value: value[some]))
     longest = int(part["lengths"].max()) if "lengths" in part else None
     return {name: value[:, :longest] if value.dim() == 3 else value for name, value in part.items()}
 
 
-def pieces(batch: Mapping[str, Any]) -> Iterator[tuple[Tensor, dict[str, Any]]]:
+def split_by_length(batch: Mapping[str, Any]) -> Iterator[tuple[Tensor, dict[str, Any]]]:
     """Yield the row indices and the rows of parts of a batch, shortest first."""
     x = batch["x"]
     lengths = batch.get("lengths", torch.full((len(x),), x.shape[1]))
@@ -147,7 +147,7 @@ def pieces(batch: Mapping[str, Any]) -> Iterator[tuple[Tensor, dict[str, Any]]]:
         stop = start + 1
         while stop < len(order) and (stop + 1 - start) * int(lengths[order[stop]]) <= AT_ONCE:
             stop += 1
-        yield order[start:stop], trimmed(batch, order[start:stop])
+        yield order[start:stop], trim_padding(batch, order[start:stop])
         start = stop
 
 
@@ -162,8 +162,8 @@ def measured(model: Any, case: str, data: Data, part: str, seed: int) -> dict[st
     scores = {name: torch.zeros(count, dtype=torch.float64) for name in names}
     sound, clips = np.zeros(count), [key[1] for key in windows.keys]
     torch.manual_seed(seed)
-    for rows, some in pieces(batch):
-        bound = dvae.iwae_bound(model, some, particles=particles, chunk=HELD // some["x"].shape[1])
+    for rows, some in split_by_length(batch):
+        bound = dvae.iwae_bound(model, some, particles=particles, chunk=PARTICLES_AT_ONCE // some["x"].shape[1])
         with torch.no_grad():
             terms = dvae.SequenceELBO(num_particles=10 if model.latents else 1).terms(model, some)
         values_by_name = {BOUND: bound.bound, KHAT: bound.khat, ELBO: terms.bound}
@@ -206,7 +206,7 @@ def run(data: Data, part: str, case: str, seed: int, out: Path) -> dict[str, Any
     method = dvae.method(case, **{"scheduled_sampling": 0.0, **options["options"]})
     training = {**section.training, **options.get("training", {})}
     windows, validation = training_data.windows("train"), training_data.windows("validation")
-    source = Alike(windows) if "lengths" in windows.all() else windows
+    source = SimilarLengths(windows) if "lengths" in windows.all() else windows
     fit = fit_or_load(method, training_data, source, validation, out=out, seed=seed, **training)
     model = fit.model.eval()
     weights = sum(parameter.numel() for parameter in model.parameters())

@@ -48,7 +48,7 @@ METRIC_MODEL: dict[str, Any] = {"optimizer": "adam", "learning_rate": 2e-3, "mom
 METRIC_MODEL |= {"examples": 4000, "steps": 400}
 PROBE, NOTHING = {"z": Normal(50.0, 50**0.5)}, {"z": Normal(0.0, 1e-6)}
 SCORES = ("APD", "ADE", "FDE", "jerk")
-PROBED, UNSAID = "probed", "unsaid"
+PROBED, INDICES_ONLY = "probed", "unsaid"
 BODY = (
     *("hip", "abdomen", "chest", "neck", "head"),
     *(side + joint for side in "lr" for joint in ("Collar", "Shldr", "ForeArm", "Hand")),
@@ -166,8 +166,13 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
         # over all drawn.
         with seeded_evaluation(model, seed):
             all_drawn, once = (code_diversity(model, batch).mean() for batch in (past, model.read(past)))
-        unsaid = dvae.evaluate({OURS: model, UNSAID: RedrawnModel(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts)
-        measurement |= {"latent": float(once / all_drawn), "indices": unsaid.ratio(UNSAID, OURS, "APD").mean}
+        indices_only = dvae.evaluate(
+            {OURS: model, INDICES_ONLY: RedrawnModel(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts
+        )
+        measurement |= {
+            "latent": float(once / all_drawn),
+            "indices": indices_only.ratio(INDICES_ONLY, OURS, "APD").mean,
+        }
     return measurement
 
 
@@ -194,7 +199,7 @@ SCORED: dict[str, Callable[[Row], str]] = {
     "FDE (m)": lambda row: row.format_score("FDE", 3),
     "jerk (m/s³)": lambda row: row.format_score("jerk"),
 }
-LISTENING: dict[str, Callable[[Row], str]] = {
+NOISE_COLUMNS: dict[str, Callable[[Row], str]] = {
     "codes, first": codes(itemgetter(0)),
     "greatest": codes(max),
     "least": codes(min),
@@ -207,7 +212,7 @@ LISTENING: dict[str, Callable[[Row], str]] = {
 """Columns that show whether the decoder uses the noise."""
 
 
-def heard(rows: Mapping[str, Row]) -> dict[str, Row]:
+def rows_with_noise(rows: Mapping[str, Row]) -> dict[str, Row]:
     """Return the rows of methods with noise."""
     return {name: row for name, row in rows.items() if row.name == OURS and row.runs[0]["codes"]["diversity"][-1] > 0}
 
@@ -228,7 +233,10 @@ def tables(name: str, rows: Mapping[str, Row]) -> dict[str, Table]:
     clips, costs = first["futures"]["weights"], budget(rows.values(), SECTIONS[name].steps)
     note = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {costs}"
     futures = {case: row.of("futures") for case, row in rows.items()}
-    named_tables = {"futures": tabled(futures, SCORED, note=note), "noise": tabled(heard(rows), LISTENING)}
+    named_tables = {
+        "futures": tabled(futures, SCORED, note=note),
+        "noise": tabled(rows_with_noise(rows), NOISE_COLUMNS),
+    }
     named_tables |= {"angles": angles(rows)} if "angles" in first else {}
     return {f"mix_and_match/{folder(name)}-{kind}": table for kind, table in named_tables.items()}
 
@@ -236,7 +244,7 @@ def tables(name: str, rows: Mapping[str, Row]) -> dict[str, Table]:
 @styled
 def draw(cases: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None:
     """Draw the diversity of codes over training, one panel for each method, and quality against diversity."""
-    ways = {name: row.of("futures") for name, row in heard(cases).items()}
+    ways = {name: row.of("futures") for name, row in rows_with_noise(cases).items()}
     rows = math.ceil((len(ways) + 1) / 3)
     figure = new_figure(7, 2.2 * rows + 0.6)
     panels = list(figure.subplots(rows, 3, squeeze=False).flat)

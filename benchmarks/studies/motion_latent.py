@@ -27,7 +27,7 @@ from dvae.motion.segments.reconstruction import reconstruct_segments
 from .engine import OURS, Row, budget, fit_or_load, folder, interval, measure, read, settings
 from .results import Table, tabled, write
 
-TUNING, HELD = "tuning", "held out"
+TUNING, HELD_OUT = "tuning", "held out"
 SAME, OTHER = "same source", "other source"
 GROUPS = {"A": "train", "B": "test"}
 """Splits of the file groups of bandai2 for tuning, which replace the split of the file."""
@@ -38,7 +38,7 @@ FALLS = ("falls", "falls where the run is shorter")
 ERROR, DURATION = "vertex error", "duration error"
 FULL, FIRST, SHAPED = "both phases", "first phase alone", "guide with beta"
 CASES = settings(__file__)
-SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD: CASES["named"]}
+SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD_OUT: CASES["named"]}
 
 
 @cache
@@ -51,7 +51,7 @@ def segments(section: str, file: Path, **options: Any) -> SegmentData:
     return SegmentData(str(file), people, **options)
 
 
-def elsewhere(file: Path, timed: motion.TimedFrames) -> Segments:
+def other_source(file: Path, timed: motion.TimedFrames) -> Segments:
     """Return all gait cycles of a source outside the training data."""
     return Segments(SegmentData.open(file).segments, timed)
 
@@ -97,8 +97,8 @@ def run(section: str, file: Path, other: Path | None, steps: int, case: str, see
     train, method = data.windows("train"), dvae.method("motion-latent", **options.get("method", {}))
     fit = fit_or_load(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **TRAINING)
     tests = {SAME: data.windows("test")}
-    if other is not None and section == HELD:
-        tests[OTHER] = elsewhere(other, data.timed)
+    if other is not None and section == HELD_OUT:
+        tests[OTHER] = other_source(other, data.timed)
     measurement = measured(fit.model.eval(), tests, train, seed)
     return {"seconds": fit.processor_seconds, "steps": steps, **measurement}
 
@@ -132,7 +132,7 @@ SCORED: dict[str, Callable[[Row], str]] = {
 INTERPOLATED = {name: partial(falling, name) for name in FALLS}
 
 
-def against(cases: Mapping[str, Row]) -> Table:
+def difference_table(cases: Mapping[str, Row]) -> Table:
     """Return a table of paired differences of vertex errors, expected below zero, with intervals."""
     linear = next(name for name in cases if cases[name].name != OURS)
     pairs = ((FULL, FIRST), (FULL, linear), (FIRST, linear), (SHAPED, FULL))
@@ -153,7 +153,7 @@ def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
         note = f"{len(takes)} segments of {len({*takes})} takes. {costs}"
         name = f"motion_latent_4d/{folder(section)}-{folder(test)}"
         available[name] = tabled(rows, SCORED | (INTERPOLATED if test == SAME else {}), note=note)
-        available[f"{name}-differences"] = against(rows)
+        available[f"{name}-differences"] = difference_table(rows)
     return available
 
 

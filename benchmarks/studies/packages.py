@@ -34,7 +34,7 @@ WALK = {
 }
 """Packages on the way from x in a file to the loss, in this order."""
 
-SAYS = {
+CAPTIONS = {
     "cli": "the program dvae",
     "runs": "directories of fits",
     "testing": "tests for your models",
@@ -70,7 +70,7 @@ def imports() -> nx.DiGraph:
     return graph
 
 
-def storeys(graph: nx.DiGraph) -> list[list[str]]:
+def levels_of(graph: nx.DiGraph) -> list[list[str]]:
     """Return packages by level, each on the lowest level above its imports; import cycles share a level."""
     circles = nx.condensation(graph)
     floors = nx.topological_generations(circles.reverse())
@@ -79,7 +79,7 @@ def storeys(graph: nx.DiGraph) -> list[list[str]]:
 
 def draw(graph: nx.DiGraph, ax: Axes) -> None:
     """Draw packages as boxes on their levels, with imports as edges."""
-    floors, width, height = storeys(graph), 2.3, 0.62
+    floors, width, height = levels_of(graph), 2.3, 0.62
     places: dict[str, tuple[float, float]] = {}
     for level, floor in enumerate(floors):
         known = {n: [places[m][0] for m in graph.successors(n) if m in places] for n in floor}
@@ -114,8 +114,8 @@ def draw(graph: nx.DiGraph, ax: Axes) -> None:
         box.set(facecolor=face, edgecolor=edge, linewidth=1.2, zorder=2)
         ax.add_patch(box)
         ax.text(x, y + 0.1, name, ha="center", va="center", fontsize=11, fontweight="bold", zorder=3)
-        says = WALK.get(name) or SAYS.get(name, "")
-        ax.text(x, y - 0.15, says, ha="center", va="center", fontsize=8, color="0.25", zorder=3)
+        caption = WALK.get(name) or CAPTIONS.get(name, "")
+        ax.text(x, y - 0.15, caption, ha="center", va="center", fontsize=8, color="0.25", zorder=3)
         if walked:
             spot = {"boxstyle": "circle,pad=0.25", "facecolor": edge, "edgecolor": "white"}
             ax.text(
@@ -136,7 +136,7 @@ def main(out: Path = DOCS / "img" / "packages.png") -> None:
         out: file of the picture.
     """
     graph = imports()
-    figure = new_figure(7, len(storeys(graph)))
+    figure = new_figure(7, len(levels_of(graph)))
     draw(graph, figure.subplots())
     figure.savefig(out, dpi=200)
 

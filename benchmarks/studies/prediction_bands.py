@@ -41,7 +41,7 @@ TUNING = ("active", "elderly", "exhausted")
 
 
 @dataclass(frozen=True)
-class Scored:
+class ForecastDistances:
     """Distances of the true futures of two unseen styles from forecasts.
 
     Args:
@@ -55,7 +55,9 @@ class Scored:
     styles: np.ndarray
 
     @classmethod
-    def of(cls, windows: motion.Windows, parts: Iterator[tuple[torch.Tensor, torch.Tensor]], spread: Any) -> Scored:
+    def of(
+        cls, windows: motion.Windows, parts: Iterator[tuple[torch.Tensor, torch.Tensor]], spread: Any
+    ) -> ForecastDistances:
         """Return the distances of batches of forecasts (B, K, H, D) and true futures."""
         distances = torch.cat(
             [standardised(forecasts, true, forecasts.std(1) if spread is None else spread) for forecasts, true in parts]
@@ -71,17 +73,17 @@ class Scored:
         return float(np.mean(clip_means(inside, test_clips)))
 
 
-def across(scored: Scored) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def splits_by_style(distances: ForecastDistances) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield masks of calibration and test windows: each style calibrates once, the other tests."""
-    for style in np.unique(scored.styles):
-        yield scored.styles == style, scored.styles != style
+    for style in np.unique(distances.styles):
+        yield distances.styles == style, distances.styles != style
 
 
-def within(scored: Scored, times: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def splits_by_clip(distances: ForecastDistances, times: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield masks of the windows of random halves of the clips of both styles."""
-    random, clips = np.random.default_rng(0), int(scored.places.max()) + 1
+    random, clips = np.random.default_rng(0), int(distances.places.max()) + 1
     for _ in range(times):
-        half = np.isin(scored.places.numpy(), random.permutation(clips)[: clips // 2])
+        half = np.isin(distances.places.numpy(), random.permutation(clips)[: clips // 2])
         yield half, ~half
 
 
@@ -141,9 +143,12 @@ def main(runs: Path, data: Path, results: Path | None = None, models: int = 10, 
             "zero velocity": ("zero velocity", residual.square().mean(0).sqrt()),
         }
         for name, (forecaster, spread) in rows.items():
-            scored = Scored.of(windows, futures(prepare_windows(windows), forecaster, training), spread)
-            for calibration, splits in (("another style", across(scored)), ("other clips", within(scored, halves))):
-                shares = [{region: scored.coverage(region, *split) for region in REGIONS} for split in splits]
+            distances = ForecastDistances.of(windows, futures(prepare_windows(windows), forecaster, training), spread)
+            for calibration, splits in (
+                ("another style", splits_by_style(distances)),
+                ("other clips", splits_by_clip(distances, halves)),
+            ):
+                shares = [{region: distances.coverage(region, *split) for region in REGIONS} for split in splits]
                 shares_by_row.setdefault(f"{name}, calibrated on {calibration}", []).extend(shares)
         if styles == TUNING:
             write(results, tables_of_split(model, dataset, thinned))

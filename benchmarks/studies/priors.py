@@ -59,7 +59,7 @@ def rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())
 
 
-def together(posterior: Distribution) -> Distribution:
+def pooled(posterior: Distribution) -> Distribution:
     """Return the mean and deviation (T, D) of the mixture of the posteriors of all windows."""
     mean, deviation = posterior
     return mean.mean(0), (mean.var(0, correction=0) + deviation.square().mean(0)).sqrt()
@@ -82,12 +82,12 @@ def with_common(
     return changed
 
 
-def few(windows: Any) -> Any:
+def table_scores(windows: Any) -> Any:
     """Return the scores of the table."""
     return [each for each in motion.scores(windows) if each.name in SCORES]
 
 
-def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
+def rows_of_run(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
     """Yield the rows of a run, one for each number of given paths."""
     run = loaded(path)
     if run.method.name != "trajevae":
@@ -102,11 +102,11 @@ def lines(path: Path, counts: tuple[int, ...]) -> Iterator[list[str]]:
         off = torch.hypot(mean - prior_mean, deviation) / prior_deviation
         low, high = off.square().mean(0).sqrt().quantile(torch.tensor(BETWEEN)).tolist()
         widths = [rms(mean - mean.mean(0)), rms(deviation), rms(prior_mean - prior_mean.mean(0)), rms(prior_deviation)]
-        common = together(distribution(model, guide, train.given(JOINTS[:count])))
+        common = pooled(distribution(model, guide, train.given(JOINTS[:count])))
         cells = []
         for scale, parts in DISTRIBUTIONS.values():
             with patch.object(prior, "forward", with_common(prior.forward, common, parts)):
-                means = mean_scores(model, windows, few, options={"temperature": scale})
+                means = mean_scores(model, windows, table_scores, options={"temperature": scale})
             cells.append([f"{means[name]:.2f}" for name in SCORES])
         spreads = [*(f"{value:.2f}" for value in widths), f"{rms(off):.2f} ({low:.2f}, {high:.2f})"]
         yield [path.name, str(count), *spreads, *(each for values in zip(*cells, strict=True) for each in values)]
@@ -126,7 +126,7 @@ def main(
     """
     widths = ["posterior means", "posterior", "prior means", "prior", "z in units of the prior"]
     header = ["", "given", *widths, *(f"{score}, {name}" for score in SCORES for name in DISTRIBUTIONS)]
-    write(results, {"trajevae/priors": Table(header, [line for run in runs for line in lines(run, counts)])})
+    write(results, {"trajevae/priors": Table(header, [line for run in runs for line in rows_of_run(run, counts)])})
 
 
 if __name__ == "__main__":

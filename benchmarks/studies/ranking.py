@@ -287,7 +287,7 @@ def work(
         if view.parts:
             wrappers: dict[str, Any] = {
                 "held": FixedLowerBody,
-                "nearest": partial(NearestLowerBody, lower=places(windows)["lower"]),
+                "nearest": partial(NearestLowerBody, lower=coordinates_of_parts(windows)["lower"]),
             }
             models = {name: wrappers.get(view.parts, lambda free: free)(model) for name, model in models.items()}
         scores = diversities if view.parts else motion_scores(by)
@@ -348,7 +348,7 @@ class NearestLowerBody(WrappedModel):
         return {"x": candidates.take_along_dim(nearest[..., None, None], 0)}
 
 
-def places(windows: Any) -> dict[str, list[int]]:
+def coordinates_of_parts(windows: Any) -> dict[str, list[int]]:
     """Return the indices of the coordinates of each body part."""
     parts = body_parts(windows.skeleton, tuple(UNIONS))
     return {part: [3 * joint + axis for joint in joints for axis in range(3)] for part, joints in parts.items()}
@@ -360,7 +360,7 @@ def diversities(windows: Any) -> list[Measure]:
     def of(place: Any) -> Any:
         return lambda forecasts, *_: average_pairwise_distance(forecasts[..., place])
 
-    selections = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
+    selections = {"APD": slice(None)} | {f"APD {part}": place for part, place in coordinates_of_parts(windows).items()}
     return [Measure(name, of(place), "m", "higher") for name, place in selections.items()]
 
 

@@ -108,7 +108,7 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
         cells = []
         for label in labels:
             fitted = halves(values_by_label[label], places)
-            cells.append(share(read_label(values, values_by_label[label], fitted), places[~fitted]))
+            cells.append(format_accuracy(read_label(values, values_by_label[label], fitted), places[~fitted]))
         varied = float((lengths.std(0) / lengths.mean(0)).mean())
         fitted = halves([""] * len(x), places)
         cells.append(f"{read_lengths(values, lengths, fitted):.2f}" if varied > ONE_BODY else "–")
@@ -116,7 +116,7 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
     return lines
 
 
-def share(right: Tensor, places: Tensor) -> str:
+def format_accuracy(right: Tensor, places: Tensor) -> str:
     """Format the mean over windows with its standard error, clustered by clip."""
     _, clips = np.unique(places.numpy(), return_inverse=True)
     estimate = TwoWayErrors.by_clip(right.numpy()[None], np.ones(len(clips)), clips).estimate()

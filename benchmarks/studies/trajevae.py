@@ -29,7 +29,7 @@ METRICS = {
 """Measures of motions, with their formats."""
 
 
-def figures(completion: Completion, true: np.ndarray) -> tuple[float, ...]:
+def measure_completion(completion: Completion, true: np.ndarray) -> tuple[float, ...]:
     """Return the means of the measures over motions, frames, and joints or bones, given true bone lengths."""
     off = np.stack([*completion.errors.values()])
     bones = np.abs(completion.skeleton.bone_lengths(completion.positions) / true - 1)
@@ -58,7 +58,7 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
         for motion in motions:
             paths = {joint: motion[1:, windows.skeleton.find(joint)] for joint in joints[:number]}
             completion = run.model.complete(motion[0], paths, samples=samples, exact=exact)
-            values.append(figures(completion, windows.skeleton.bone_lengths(motion[:1])))
+            values.append(measure_completion(completion, windows.skeleton.bone_lengths(motion[:1])))
         elapsed = (time.perf_counter() - start) / (len(motions) * samples)
         means = [
             TwoWayErrors.by_clip(each[None], np.ones(len(motions)), clips).estimate() for each in np.transpose(values)

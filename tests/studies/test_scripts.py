@@ -318,13 +318,13 @@ def test_completion(tmp_path, out, short, monkeypatch):
     assert [row[0] for row in completions[1:]][-2:] == ["10 points, 100 frames, markers", "0 points, 4 frames, markers"]
     for row in completions[1:]:
         assert float(row[4].split()[0]) < float(row[1].split()[0])
-    assert [row[0] for row in sure[1:]] == [str(sight) for sight in completion.SURE]
+    assert [row[0] for row in sure[1:]] == [str(sight) for sight in completion.UNCERTAINTY_CASES]
     errors, _ = engine.read_all(tmp_path / "out", "references").runs
-    last, first = (completion.at(errors["times"][completion.moments(30.0)[1] - ahead]) for ahead in (1, 0))
+    last, first = (completion.at(errors["times"][completion.observed_times(30.0)[1] - ahead]) for ahead in (1, 0))
     for row in errors["rows"].values():
         assert max(row[last]) == 0 < min(row[first])
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    monkeypatch.setattr(completion, "TRIED", {"surface": (0.01,), "marker": (), "point": ()})
+    monkeypatch.setattr(completion, "TUNED_DEVIATIONS", {"surface": (0.01,), "marker": (), "point": ()})
     monkeypatch.setattr(completion, "DESCENTS", [])
     completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "results": None})
     assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2
@@ -431,7 +431,7 @@ def test_priors(folder, out, monkeypatch):
 def test_the_common_prior_has_the_moments_of_the_mixture_of_posteriors():
     torch.manual_seed(0)
     mean, deviation = torch.randn(5, 3, 2), torch.rand(5, 3, 2)
-    common = priors.together((mean, deviation))
+    common = priors.pooled((mean, deviation))
     draws = (mean + deviation * torch.randn(20_000, 5, 3, 2)).flatten(0, 1)
     for moment, expected in zip(common, (draws.mean(0), draws.std(0)), strict=True):
         torch.testing.assert_close(moment, expected, atol=0.03, rtol=0)
@@ -927,4 +927,4 @@ def test_packages(tmp_path):
 
 def test_packages_are_above_their_imports():
     graph = nx.DiGraph([("roof", "walls"), ("walls", "ground"), ("roof", "ground"), ("shed", "ground")])
-    assert packages.storeys(graph) == [["ground"], ["shed", "walls"], ["roof"]]
+    assert packages.levels_of(graph) == [["ground"], ["shed", "walls"], ["roof"]]
