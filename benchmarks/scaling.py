@@ -48,7 +48,7 @@ TARGETS = {
 OPTIONS = {"steps": 10**6, "accelerator": "cpu", "progress": False}
 
 
-def begun(name: str, size: int = SIZE, **options: int) -> dvae.SVI:
+def start_svi(name: str, size: int = SIZE, **options: int) -> dvae.SVI:
     torch.manual_seed(0)
     svi = dvae.SVI(dvae.method(name).build({"x": size}), **OPTIONS | options)
     svi.init()
@@ -62,14 +62,14 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
     """Measure a method in each of two processes; the first process prints the rows."""
     with mock.patch.dict(os.environ):
         del os.environ["TORCHELASTIC_RUN_ID"]
-        single_process = begun(name)
-    two_processes, exchange_time, together = begun(name), [0.0], processes.average_gradients
+        single_process = start_svi(name)
+    two_processes, exchange_time, average = start_svi(name), [0.0], processes.average_gradients
     fabric, x, go_on = two_processes.fabric, torch.randn(METHODS[name], FRAMES, SIZE), torch.zeros(2, dtype=torch.int)
 
     def timed(*arguments: object) -> tuple[Tensor, Tensor | float]:
         start = time.process_time()
         try:
-            return together(*arguments)  # type: ignore[arg-type]
+            return average(*arguments)  # type: ignore[arg-type]
         finally:
             exchange_time[0] += time.process_time() - start
 
@@ -97,7 +97,7 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
         _, busy = turn(two_processes)
         return exchange_time[0] / busy
 
-    with mock.patch.object(processes, "together", timed):
+    with mock.patch.object(processes, "average_gradients", timed):
         times = [(one(), turn(two_processes)[0], turn(single_process)[0], exchange()) for _ in range(turns)][2:]
     if fabric.global_rank == 0:
         single, both, uncoupled, share = (min(each) for each in zip(*times, strict=True))
@@ -128,7 +128,7 @@ def sizes(name: str) -> dict[str, float]:
     """Return the exponents of a method's training step."""
 
     def step(batch: int = 8, frames: int = FRAMES, size: int = SIZE, particles: int = 1) -> Callable[[], object]:
-        svi, x = begun(name, size, particles=particles), torch.randn(batch, frames, size)
+        svi, x = start_svi(name, size, particles=particles), torch.randn(batch, frames, size)
         return lambda: svi.step(x)
 
     return {
@@ -141,7 +141,7 @@ def sizes(name: str) -> dict[str, float]:
 
 def clips(name: str) -> dict[str, float]:
     """Return the exponents of a training step and of a validation over the number of clips."""
-    svi = begun(name)
+    svi = start_svi(name)
 
     def windows(count: int, split: str) -> motion.Windows:
         return motion.windows(motion.simulate(clips=count), motion.PROTOCOLS["simulated"], split)
