@@ -43,52 +43,52 @@ PROCESSORS = {
     "mapped": "is of files and of the process's memory",
     "scaling": "is of processes that share the cores",
 }
-"""Rows that are left out on a GPU, or all of a benchmark, and why."""
+"""Rows or whole benchmarks that a GPU skips, with the reason."""
 WORSE = 1.1
 Target = tuple[str, float | None]
 Targets = Mapping[str, Target]
 Rows = dict[str, float]
-BESIDE = "DVAE_BENCH_BESIDE"
-"""Set where a release is measured beside what came after it, and compared with nothing itself."""
+RELEASE_RUN = "DVAE_BENCH_BESIDE"
+"""Environment variable of the process that measures a release, which makes no comparison of its own."""
 LESS = ("at most", "under")
 COMPARED = ("at most", "at least")
 
 
 def measured(name: str, device: torch.device) -> tuple[Rows, dict[str, Target]]:
-    """Rows of a benchmark and their targets, named after it."""
+    """Run a benchmark; return its rows and their targets, with the benchmark's name as prefix."""
     module = importlib.import_module(f".{name}", __package__)
     torch.manual_seed(0)
-    found = module.rows(device)
-    targets = {f"{name}: {row}": module.TARGETS.get(row, ("at most", None)) for row in found}
-    return {f"{name}: {row}": value for row, value in found.items()}, targets
+    values = module.rows(device)
+    targets = {f"{name}: {row}": module.TARGETS.get(row, ("at most", None)) for row in values}
+    return {f"{name}: {row}": value for row, value in values.items()}, targets
 
 
-def met(value: float, target: Target) -> bool:
-    """Whether a row is where its target has it."""
+def meets(value: float, target: Target) -> bool:
+    """Return whether a value meets its target."""
     side, bound = target
     return bound is None or (value <= bound if side in LESS else value >= bound)
 
 
 def better(one: Rows, other: Mapping[str, float], targets: Targets) -> Rows:
-    """Of two measurements of each row."""
+    """Return the better of two measurements of each row."""
     both = {row: (value, other.get(row, value)) for row, value in one.items()}
     return {row: (min if targets[row][0] in LESS else max)(values) for row, values in both.items()}
 
 
 def slower(rows: Mapping[str, float], targets: Targets, before: Mapping[str, float]) -> list[str]:
-    """Rows that are worse than before by more than a tenth, or miss a target that they met."""
+    """Return the rows that are worse than before by more than a tenth, or miss a target that they met."""
 
     def is_slower(row: str) -> bool:
         (side, _), now, then = targets[row], rows[row], before[row]
         costs = side in COMPARED and (now > WORSE * then if side in LESS else then > WORSE * now)
-        return costs or (met(then, targets[row]) and not met(now, targets[row]))
+        return costs or (meets(then, targets[row]) and not meets(now, targets[row]))
 
     return [row for row in rows if row in before and is_slower(row)]
 
 
 def missed(values: Mapping[str, float], targets: Targets) -> list[str]:
     """Return one message for each row that misses its target."""
-    rows = [row for row in values if not met(values[row], targets[row])]
+    rows = [row for row in values if not meets(values[row], targets[row])]
     return [f"{row}: {values[row]:.2f} must be {targets[row][0]} {targets[row][1]:g}" for row in rows]
 
 
@@ -105,8 +105,8 @@ def _git(*arguments: str) -> str:
     return process.stdout.strip() or "done"
 
 
-def there(commit: str, name: str, device: str, threads: int) -> Rows:
-    """Rows of a benchmark by the code of a commit, measured here and now; none where it cannot be had or run."""
+def measure_at_commit(commit: str, name: str, device: str, threads: int) -> Rows:
+    """Measure a benchmark with the code of a commit on this machine; empty if checkout or run fail."""
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "code", Path(folder) / "rows.json"
         if not commit or not _git("worktree", "add", "--detach", str(path), commit):
@@ -114,7 +114,7 @@ def there(commit: str, name: str, device: str, threads: int) -> Rows:
         try:
             options = ["--threads", str(threads), "--out", str(out), *(["--device", device] if device != "cpu" else [])]
             command = [sys.executable, "-m", "benchmarks.bench", name, *options]
-            environment = os.environ | {"PYTHONPATH": str(path), BESIDE: "1"}
+            environment = os.environ | {"PYTHONPATH": str(path), RELEASE_RUN: "1"}
             subprocess.run(command, cwd=path, env=environment, capture_output=True, check=False)
             rows: Rows = json.loads(out.read_text())["rows"] if out.exists() else {}
             return rows
@@ -123,7 +123,7 @@ def there(commit: str, name: str, device: str, threads: int) -> Rows:
 
 
 def machine(device: torch.device) -> dict[str, Any]:
-    """What numbers were measured on."""
+    """Return device, processor and versions of this machine."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
@@ -138,9 +138,13 @@ def machine(device: torch.device) -> dict[str, Any]:
     }
 
 
-def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
+def add_record(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the history with a record added; a version keeps its first and its last record, with rows merged."""
-    alike = [each for each in records if (each["version"], how(each)) == (record["version"], how(record))]
+    alike = [
+        each
+        for each in records
+        if (each["version"], device_and_threads(each)) == (record["version"], device_and_threads(record))
+    ]
     matching = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
     merged = {
         key: {name: value for part in (*matching, record) for name, value in part[key].items()}
@@ -151,9 +155,13 @@ def kept(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str
     return [record | merged if each is matching[0] else each for each in records]
 
 
-def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
+def release_rows(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
     """Return the reference of each row, the first number of the last version in other commits, and its commit."""
-    others = [each for each in records if how(each) == how(record) and each["commit"] != record["commit"]]
+    others = [
+        each
+        for each in records
+        if device_and_threads(each) == device_and_threads(record) and each["commit"] != record["commit"]
+    ]
     reference: dict[str, tuple[float, str]] = {}
     for each in others:
         if each["version"] == others[-1]["version"]:
@@ -161,29 +169,29 @@ def released(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str,
     return reference
 
 
-def how(record: dict[str, Any]) -> tuple[str, int]:
+def device_and_threads(record: dict[str, Any]) -> tuple[str, int]:
     """Return the device and the number of threads of a record; records without them are from the processor."""
     return record["machine"].get("device", "cpu"), record["machine"]["threads"]
 
 
 def tabulate(records: list[dict[str, Any]], results: Path = RESULTS) -> None:
     """Write the table of the last record and of the release; a GPU has a table of its own."""
-    last, before = records[-1], released(records, records[-1])
+    last, before = records[-1], release_rows(records, records[-1])
     lines = []
     for name in sorted(last["rows"], key=_place):
         value, (side, bound) = last["rows"][name], last["targets"].get(name, ("at most", None))
-        target = ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if met(value, (side, bound)) else "no"]
+        target = ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if meets(value, (side, bound)) else "no"]
         release = f"{before[name][0]:.2f}" if name in before else "–"
         change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
         lines.append([name, *target, f"{value:.2f}", release, change])
     commits = sorted({commit for _, commit in before.values()})
     note = f"Last: {last['version']} ({last['commit']}), {last['date']}; release: {', '.join(commits) or 'none'}."
     history = Table(["", "target", "met", "last", "release", "last over release"], lines, note)
-    write(results, {f"speed/{'history' if how(last)[0] == 'cpu' else 'gpu-history'}": history})
+    write(results, {f"speed/{'history' if device_and_threads(last)[0] == 'cpu' else 'gpu-history'}": history})
 
 
 def _place(row: str) -> int:
-    """Of a row's benchmark among all."""
+    """Return the position of a row's benchmark in `NAMES`."""
     name = row.partition(":")[0]
     return NAMES.index(name) if name in NAMES else len(NAMES)
 
@@ -195,7 +203,7 @@ def main(
     out: Path = Path("bench.json"),
     keep: bool = False,
 ) -> int:
-    """Measure.
+    """Run benchmarks.
 
     Args:
         names: benchmarks to run.
@@ -222,7 +230,7 @@ def main(
         "machine": machine(place),
     }
     records = json.loads(HISTORY.read_text()) if HISTORY.exists() else []
-    release = {} if BESIDE in os.environ else released(records, record)
+    release = {} if RELEASE_RUN in os.environ else release_rows(records, record)
     numbers: Rows = {}
     targets: dict[str, Target] = {}
     failed: list[str] = []
@@ -241,7 +249,7 @@ def main(
             rows = better(rows, measured(name, place)[0], bounds)
         if doubtful := slower(rows, bounds, before):
             for old in {release[row][1] for row in doubtful}:
-                old_rows = there(old, name, device, threads)
+                old_rows = measure_at_commit(old, name, device, threads)
                 before |= {row: value for row, value in old_rows.items() if row in before and release[row][1] == old}
             failed += [
                 f"{row}: {rows[row]:.2f} was {before[row]:.2f} at the last release"
@@ -254,10 +262,10 @@ def main(
             print(f"  {row:50} {value:8.2f} {was}   {'' if bound is None else f'{side} {bound:g}'}", flush=True)
         numbers |= {row: round(value, 4) for row, value in rows.items()}
         targets |= bounds
-        written = record | {"rows": numbers, "targets": targets}
-        out.write_text(json.dumps(written, indent=1) + "\n")
+        record_now = record | {"rows": numbers, "targets": targets}
+        out.write_text(json.dumps(record_now, indent=1) + "\n")
         if keep:
-            records = kept(records, written)
+            records = add_record(records, record_now)
             HISTORY.write_text(json.dumps(records, indent=1) + "\n")
             tabulate(records)
     for title, lines in (("targets missed:", missed(numbers, targets)), ("slower than at the last release:", failed)):

@@ -22,7 +22,7 @@ from dvae.motion import bodies
 from dvae.motion.segments.completion import complete, simulate_observations
 from dvae.motion.segments.embodied import Segments
 
-from .speed import moved, stopwatch
+from .speed import stopwatch, to_device
 
 MANY, STEPS = 100, 101
 TARGETS = {
@@ -39,27 +39,27 @@ def rows(device: torch.device) -> dict[str, float]:
     model, batch = MotionLatent().build(segments).eval(), segments.all()
     rows = list(islice(cycle(range(len(segments))), MANY))
     x, shape = batch["x"][rows], batch["beta"][rows]
-    seen = moved(simulate_observations(model, x, shape, "markers", frames=range(0, 100, 20)), device)
+    observations = to_device(simulate_observations(model, x, shape, "markers", frames=range(0, 100, 20)), device)
     model.to(device)
 
     clock = stopwatch()
 
     def seconds(descent: dvae.Descent, end: int) -> float:
-        begun = clock()
-        complete(model, {name: value[:end] for name, value in seen.items()}, descent=descent)
-        return clock() - begun
+        start = clock()
+        complete(model, {name: value[:end] for name, value in observations.items()}, descent=descent)
+        return clock() - start
 
     descents = {steps: dvae.Descent(steps=steps, starts=1, candidates=1, newton=0) for steps in (1, STEPS)}
     descents |= {"whole": dvae.Descent(starts=1), "starts": dvae.Descent()}
-    # the two sides in turns, so that what else the machine does counts for both
+    # the sides alternate, so that other processes affect both
     rounds = [
         {(name, end): seconds(each, end) for name, each in descents.items() for end in (1, MANY)} for _ in range(3)
     ]
     least = {key: min(times[key] for times in rounds) for key in rounds[0]}
     steps = {end: least[STEPS, end] - least[1, end] for end in (1, MANY)}
-    found = {
+    ratios = {
         **{name: MANY * least[name, 1] / least[name, MANY] for name in ("whole", "starts")},
         "descent": MANY * steps[1] / steps[MANY],
         "curvature": MANY * least[1, 1] / least[1, MANY],
     }
-    return found
+    return ratios

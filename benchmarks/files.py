@@ -24,21 +24,21 @@ TARGETS = {"gain": ("at least", 0.6), "GB held": ("at most", 2.0), "MB of a page
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def held(process: int) -> int:
-    """Bytes that a process and those below it hold; what several share is counted once."""
-    below = [
+def used_memory(process: int) -> int:
+    """Return the memory of a process and its children in bytes; shared memory counts once."""
+    children = [
         int(child) for task in Path(f"/proc/{process}/task").iterdir() for child in _read(task / "children").split()
     ]
-    own = next(
+    pss = next(
         (line for line in _read(f"/proc/{process}/smaps_rollup").splitlines() if line.startswith("Pss:")), "Pss: 0"
     )
-    return 1024 * int(own.split()[1]) + sum(map(held, below))
+    return 1024 * int(pss.split()[1]) + sum(map(used_memory, children))
 
 
 def _read(path: str | Path) -> str:
     try:
         return Path(path).read_text()
-    except OSError:  # it has ended meanwhile
+    except OSError:  # the process has ended
         return ""
 
 
@@ -52,12 +52,12 @@ def converting(folder: Path) -> dict[str, float]:
         start = time.perf_counter()
         with ThreadPoolExecutor(1) as pool:
             options = ["--out", str(folder / f"out{jobs}"), "--format", "bvh", "--fps", "20", "--jobs", str(jobs)]
-            done = pool.submit(dvae, ["data", "convert", str(clips), *options])
-            while not done.done():
+            conversion = pool.submit(dvae, ["data", "convert", str(clips), *options])
+            while not conversion.done():
                 if Path("/proc/self/smaps_rollup").exists():
-                    most = max(most, held(os.getpid()))
+                    most = max(most, used_memory(os.getpid()))
                 time.sleep(0.2)
-        if done.result():
+        if conversion.result():
             raise SystemExit("the clips were not converted")
         seconds[jobs] = time.perf_counter() - start
     return {"gain": seconds[1] / seconds[CORES] / CORES, "GB held": most / 1e9}

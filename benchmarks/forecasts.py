@@ -38,21 +38,21 @@ def rows(file: Path, steps: int, batch_size: int) -> Iterator[tuple[str, float, 
         dvae.fit(dvae.method("hit-dvae", loss="evidence"), data, out=out, **training)
         model = dvae.load(out).model
         yield "minutes", (time.perf_counter() - start) / 60, "at most", 15.0
-    test, known = data.windows("test"), data.windows("train+validation")
-    evaluation = dvae.evaluate(model, test, scores=dvae.motion.scores, batch_size=64, training_windows=known)
+    test, training_windows = data.windows("test"), data.windows("train+validation")
+    evaluation = dvae.evaluate(model, test, scores=dvae.motion.scores, batch_size=64, training_windows=training_windows)
     print(evaluation)
-    ours, still = evaluation["model"], evaluation["zero velocity"]
-    yield from ((name, ours[name].mean, "at most", still[name].mean) for name in ("ADE", "FDE"))
-    yield from ((name, ours[name].mean, "at least", 0.1) for name in evaluation.metrics if name.startswith("KL"))
+    scores, baseline = evaluation["model"], evaluation["zero velocity"]
+    yield from ((name, scores[name].mean, "at most", baseline[name].mean) for name in ("ADE", "FDE"))
+    yield from ((name, scores[name].mean, "at least", 0.1) for name in evaluation.metrics if name.startswith("KL"))
 
     x = test.all()["x"]
     x = x[:: max(1, len(x) // WINDOWS)]
     torch.manual_seed(0)
     futures = model.forecast({"x": x[:, : test.protocol.observed]}, horizon=300, samples=2, draw_emission=False)["x"]
-    real, made = test.positions(x), test.positions(futures)
-    bones, true = test.skeleton.bone_lengths(made), test.skeleton.bone_lengths(real).mean((0, 1))
+    real, generated = test.positions(x), test.positions(futures)
+    bones, true = test.skeleton.bone_lengths(generated), test.skeleton.bone_lengths(real).mean((0, 1))
     error, second = (bones / true - 1).abs().mean((0, 1, 2)), round(test.protocol.fps)
-    end, moving = (p.diff(dim=-3).norm(dim=-1).mean().item() for p in (made[:, :, -second:], real))
+    end, moving = (p.diff(dim=-3).norm(dim=-1).mean().item() for p in (generated[:, :, -second:], real))
     yield "300 frames finite", float(torch.isfinite(futures).all()), "at least", 1.0
     yield "worst bone", error.max().item(), "at most", 0.15
     yield "mean bone", error.mean().item(), "at most", 0.15
@@ -64,13 +64,13 @@ def main(files: tyro.conf.Positional[tuple[Path, ...]] = FILES, steps: int = 240
 
     Args:
         files: motion files.
-        steps: of training.
-        batch_size: windows of each.
+        steps: number of training steps.
+        batch_size: number of windows in a batch.
     """
     missed = False
     for file in files:
         if not file.exists():
-            print(f"{file.name}: not there, left out")
+            print(f"{file.name}: not found, skipped")
             continue
         for name, value, side, bound in rows(file, steps, batch_size):
             holds = value <= bound if side == "at most" else value >= bound

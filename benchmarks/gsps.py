@@ -53,22 +53,22 @@ def rows(device: torch.device) -> dict[str, float]:
     batch = draw()
     with torch.no_grad():
         values = model.model(batch)
-    drawn = {name: values[name].requires_grad_() for name in ("lower", "upper")}
+    latents = {name: values[name].requires_grad_() for name in ("lower", "upper")}
 
-    def scored() -> None:
-        futures = model.to_data_space(dict(drawn))
+    def energy_gradients() -> None:
+        futures = model.to_data_space(dict(latents))
         sum(energy.sum() for energy in model.energies(futures, batch["x"], batch).values()).backward()
 
     past = batch["x"][:, :25]
     futures = lambda: model.forecast(past, 100, 50)  # noqa: E731
-    found = dict(zip(("step", "futures"), over_products(step, futures, repeat=5), strict=True))
-    whole, energies = seconds(step, scored, repeat=5)
-    found["energies"] = energies / whole
+    ratios = dict(zip(("step", "futures"), over_products(step, futures, repeat=5), strict=True))
+    step_time, energy_time = seconds(step, energy_gradients, repeat=5)
+    ratios["energies"] = energy_time / step_time
 
     flow, poses = model.pose_prior.flow, torch.randn(53_000, 48, device=device, requires_grad=True)
     ways = (lambda: sequential(flow, poses), lambda: flow.to_noise(poses)[0])
     both = seconds(*(lambda way=way: way().square().sum().backward() for way in ways), repeat=3)
-    found["prior"] = both[0] / both[1]
+    ratios["prior"] = both[0] / both[1]
     if device.type == "cpu":
-        found["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    return found
+        ratios["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return ratios

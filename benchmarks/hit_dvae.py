@@ -27,7 +27,7 @@ import dvae
 from dvae import motion
 from dvae.program.rollout import ScheduledSampling
 
-from .speed import Held, fed_step, over_products, seconds, stopwatch
+from .speed import TensorMemory, fed_step, over_products, seconds, stopwatch
 
 TARGETS = {
     "frame": ("at most", 1.5),
@@ -44,16 +44,16 @@ WINDOWS = 1834
 
 @torch.no_grad()
 def without_caches(model: dvae.DynamicalVAE, past: Tensor, horizon: int, samples: int) -> Tensor:
-    """Futures as in `forecast`, every conditional evaluated over the whole prefix for the sake of its last step."""
+    """Return futures as `forecast` does, but evaluate each conditional over the whole prefix at every step."""
     x = past.repeat(samples, 1, 1)
     latents = model.guide(x)
     z, w = latents["z"], latents["w"]
     for _ in range(horizon):
         x, z = (torch.cat([v, v.new_zeros(len(v), 1, v.shape[2])], 1) for v in (x, z))
-        known = {"x": x, "z": z, "w": w}
-        loc, scale = (p[:, -1] for p in model.generator["z"](known, len(x), x.shape[1]))
+        parents = {"x": x, "z": z, "w": w}
+        loc, scale = (p[:, -1] for p in model.generator["z"](parents, len(x), x.shape[1]))
         z[:, -1] = torch.addcmul(loc, scale, torch.randn_like(loc))
-        x[:, -1] = model.generator["x"](known, len(x), x.shape[1])[0][:, -1]
+        x[:, -1] = model.generator["x"](parents, len(x), x.shape[1])[0][:, -1]
     return x
 
 
@@ -64,7 +64,7 @@ def rows(device: torch.device) -> dict[str, float]:
     method.train(windows).prepare(model)
     model.to(device)
     past = model.turned(windows.all()["x"][:100, : windows.protocol.observed].to(device))
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
 
     model.eval()
     one = past[:1]
@@ -76,47 +76,47 @@ def rows(device: torch.device) -> dict[str, float]:
     )
     small = dvae.method("hit-dvae", pose_prior=0.0).build(windows).to(device).eval()
     generation = lambda: small.forecast(one, 60, 50, draw_emission=False)  # noqa: E731
-    (found["frame"],) = over_products(generation)
-    found["cache"] = anew / cached
-    found["growth"] = (long - cached) / (300 - 60) / (cached / 60)
+    (numbers["frame"],) = over_products(generation)
+    numbers["cache"] = anew / cached
+    numbers["growth"] = (long - cached) / (300 - 60) / (cached / 60)
     clock = stopwatch()
-    begun = clock()
+    start = clock()
     for part in past.split(20):
         model.forecast(part, 60, 50, draw_emission=False)
-    found["seconds"] = clock() - begun
+    numbers["seconds"] = clock() - start
 
-    def beside(samples: int) -> int:
-        with Held() as held:
+    def peak_memory(samples: int) -> int:
+        with TensorMemory() as memory:
             futures = small.forecast(past[:8], 60, samples, draw_emission=False)
-        return held.most - sum(value.untyped_storage().nbytes() for value in futures.values())
+        return memory.peak - sum(value.untyped_storage().nbytes() for value in futures.values())
 
-    found["samples"] = beside(1024) / beside(512)
+    numbers["samples"] = peak_memory(1024) / peak_memory(512)
 
     def evaluation(clips: int, batch_size: int) -> tuple[Callable[[], object], int]:
-        """Of a fifth of so many clips, and its number of windows."""
-        held = motion.windows(motion.simulate(clips), motion.PROTOCOLS["simulated"], "test")
+        """Return an evaluation of the test split of so many clips, and its number of windows."""
+        test = motion.windows(motion.simulate(clips), motion.PROTOCOLS["simulated"], "test")
         options = {"scores": motion.scores, "batch_size": batch_size, "references": False, "progress": False}
-        return lambda: dvae.evaluate(small, held, **options), len(held)
+        return lambda: dvae.evaluate(small, test, **options), len(test)
 
-    few, _ = evaluation(10, batch_size=6)  # products of as many shapes as there are frames are held
-    (found["evaluation"],) = over_products(few)
+    few, _ = evaluation(10, batch_size=6)  # few windows, because products of as many shapes as frames are stored
+    (numbers["evaluation"],) = over_products(few)
     more, count = evaluation(64, batch_size=64)
-    found["evaluation, seconds"] = seconds(more, repeat=1)[0] / count * WINDOWS
+    numbers["evaluation, seconds"] = seconds(more, repeat=1)[0] / count * WINDOWS
 
     model.train()
     draws = method.train(windows).objective.draws
 
     def step(feeding: ScheduledSampling | None) -> Callable[[], None]:
-        fed = None if feeding is None else replace(feeding, start=windows.protocol.observed)
-        return fed_step(method, model, windows, 16, device, draws=draws, scheduled_sampling=fed)[0]
+        sampled = None if feeding is None else replace(feeding, start=windows.protocol.observed)
+        return fed_step(method, model, windows, 16, device, draws=draws, scheduled_sampling=sampled)[0]
 
     kinds = {
         "exact": ScheduledSampling(1.0, gradient=False),
         "gradient": ScheduledSampling(1.0),
         "two passes": ScheduledSampling(1.0, passes=2, gradient=False),
     }
-    forced, *fed = seconds(step(None), *(step(feeding) for feeding in kinds.values()), repeat=3)
-    found |= {f"step, {kind}": each / forced for kind, each in zip(kinds, fed, strict=True)}
-    found["step, seconds"] = forced
+    forced, *sampled = seconds(step(None), *(step(feeding) for feeding in kinds.values()), repeat=3)
+    numbers |= {f"step, {kind}": each / forced for kind, each in zip(kinds, sampled, strict=True)}
+    numbers["step, seconds"] = forced
 
-    return found
+    return numbers

@@ -36,14 +36,14 @@ TARGETS = {"memory": ("at most", 1.1), "memory, motion": ("at most", 1.1), "a st
 
 
 def blocks(frames: int, size: int = FEW) -> Iterator[np.ndarray]:
-    """Frames of smooth numbers, so many at a time."""
+    """Yield frames of smooth numbers in blocks."""
     rng = np.random.default_rng(0)
     for _ in range(frames // size):
         yield np.cumsum(rng.standard_normal((size, SIZE), np.float32), 0) / 100
 
 
-def written(path: Path, frames: int) -> Path:
-    """An npy file of so many frames."""
+def write_frames(path: Path, frames: int) -> Path:
+    """Write an npy file of frames."""
     with path.open("wb") as file:
         header = {"descr": "<f4", "fortran_order": False, "shape": (frames, SIZE)}
         np.lib.format.write_array_header_1_0(file, header)
@@ -52,8 +52,8 @@ def written(path: Path, frames: int) -> Path:
     return path
 
 
-def walked(path: Path, frames: int) -> Path:
-    """An archive of a hundred clips of so many frames in all, in its own folder."""
+def write_walks(path: Path, frames: int) -> Path:
+    """Write an archive of 100 clips with so many frames in all, in its own folder."""
     path.parent.mkdir()
     [walk] = motion.simulate(1, FEW, seed=0)
     length = frames // 100
@@ -66,7 +66,7 @@ def walked(path: Path, frames: int) -> Path:
 
 
 def anonymous(process: int) -> int:
-    """Bytes that a process holds and no file does; 0 when it has ended."""
+    """Return the anonymous memory of a process in bytes; 0 if the process has ended."""
     try:
         lines = Path(f"/proc/{process}/status").read_text().splitlines()
     except OSError:
@@ -74,34 +74,34 @@ def anonymous(process: int) -> int:
     return next((1024 * int(line.split()[1]) for line in lines if line.startswith("RssAnon:")), 0)
 
 
-def most(data: Path, *options: str) -> int:
-    """Bytes of anonymous memory that fitting to these data takes at most."""
+def peak_memory(data: Path, *options: str) -> int:
+    """Return the peak anonymous memory of a fit to a file, in bytes."""
     with tempfile.TemporaryDirectory() as out:
         command = [sys.executable, "-m", "dvae.cli", "fit", "srnn", "--data", str(data), "--out", f"{out}/run"]
         command += ["--steps", "20", "--batch-size", str(BATCH), *options]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        found = 0
+        peak = 0
         while process.poll() is None:
-            found = max(found, anonymous(process.pid))
+            peak = max(peak, anonymous(process.pid))
             time.sleep(0.01)
         assert process.stderr is not None
         if process.returncode:
-            raise SystemExit(f"{data} was not fitted to: {process.stderr.read()}")
-    return found
+            raise SystemExit(f"the fit to {data} failed: {process.stderr.read()}")
+    return peak
 
 
 def steps(path: Path, frames: int = FRAMES // 10) -> dict[str, float]:
-    """Processor time of training steps and of draws, on frames that are mapped over the first of them in memory."""
+    """Return the processor time of training steps and draws, mapped over in memory."""
     mapped = PanelData.open(path, cut=CUT)
-    held = PanelData.of(np.array(mapped.panel.series[0].values[:frames]), cut=CUT)
-    sources = [data.windows("train") for data in (mapped, held)]
-    model = dvae.method("srnn").build(held.schema)
+    in_memory = PanelData.of(np.array(mapped.panel.series[0].values[:frames]), cut=CUT)
+    sources = [data.windows("train") for data in (mapped, in_memory)]
+    model = dvae.method("srnn").build(in_memory.schema)
     svi = dvae.SVI(model, progress=False)
     svi.init()
     generator = torch.Generator().manual_seed(0)
-    trained = seconds(*(lambda s=s: svi.step(s.sample(BATCH, generator)) for s in sources), repeat=50)
-    drawn = seconds(*(lambda s=s: s.sample(BATCH, generator) for s in sources), repeat=200)
-    return {"a step": trained[0] / trained[1], "a draw": drawn[0] / drawn[1]}
+    training_steps = seconds(*(lambda s=s: svi.step(s.sample(BATCH, generator)) for s in sources), repeat=50)
+    draws = seconds(*(lambda s=s: s.sample(BATCH, generator) for s in sources), repeat=200)
+    return {"a step": training_steps[0] / training_steps[1], "a draw": draws[0] / draws[1]}
 
 
 def rows(_: torch.device) -> dict[str, float]:
@@ -109,9 +109,9 @@ def rows(_: torch.device) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if shutil.disk_usage(folder).free < 2.5e9:
-            raise SystemExit(f"{folder} has less than 2.5 GB of room; set TMPDIR to a folder that has more")
-        many, few = written(folder / "many.npy", FRAMES), written(folder / "few.npy", FEW)
-        found = {"memory": most(many, *cut) / most(few, *cut), **steps(many)}
+            raise SystemExit(f"{folder} has less than 2.5 GB of free space; set TMPDIR to a folder with more")
+        many, few = write_frames(folder / "many.npy", FRAMES), write_frames(folder / "few.npy", FEW)
+        ratios = {"memory": peak_memory(many, *cut) / peak_memory(few, *cut), **steps(many)}
         many.unlink()
-        walks = [most(walked(folder / str(frames) / "walks.npz", frames)) for frames in (FRAMES, FEW)]
-    return found | {"memory, motion": walks[0] / walks[1]}
+        walks = [peak_memory(write_walks(folder / str(frames) / "walks.npz", frames)) for frames in (FRAMES, FEW)]
+    return ratios | {"memory, motion": walks[0] / walks[1]}

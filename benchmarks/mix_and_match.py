@@ -16,7 +16,7 @@ import torch
 import dvae
 from dvae import motion
 
-from .speed import moved, seconds, training_step
+from .speed import seconds, to_device, training_step
 
 TARGETS = {"feeding": ("at most", 1.75), "step": ("under", None)}
 
@@ -27,12 +27,12 @@ def rows(device: torch.device) -> dict[str, float]:
     method = dvae.method("mix-and-match").resolve_defaults(windows)
     model = method.build(windows).to(device)
     objective, bound = method.train(windows).objective, dvae.SequenceELBO()
-    batch = moved(windows.sample(32, torch.Generator().manual_seed(0)), device)
-    own, true = seconds(
+    batch = to_device(windows.sample(32, torch.Generator().manual_seed(0)), device)
+    own_poses, true_poses = seconds(
         *(
             training_step(model, lambda p=p: objective(bound.terms(model, batch, scheduled_sampling=p), 1000))
             for p in (1.0, 0.0)
         ),
         repeat=5,
     )
-    return {"feeding": own / true, "step": own}
+    return {"feeding": own_poses / true_poses, "step": own_poses}

@@ -48,7 +48,7 @@ TARGETS = {
 OPTIONS = {"steps": 10**6, "accelerator": "cpu", "progress": False}
 
 
-def begun(name: str, size: int = SIZE, **options: int) -> dvae.SVI:
+def start_svi(name: str, size: int = SIZE, **options: int) -> dvae.SVI:
     torch.manual_seed(0)
     svi = dvae.SVI(dvae.method(name).build({"x": size}), **OPTIONS | options)
     svi.init()
@@ -59,22 +59,22 @@ def begun(name: str, size: int = SIZE, **options: int) -> dvae.SVI:
 
 
 def worker(name: str, turns: int = 25, steps: int = 4) -> None:
-    """What each of two processes does; the first prints the rows."""
+    """Measure a method in each of two processes; the first process prints the rows."""
     with mock.patch.dict(os.environ):
         del os.environ["TORCHELASTIC_RUN_ID"]
-        alone = begun(name)
-    joined, spent, together = begun(name), [0.0], processes.average_gradients
-    fabric, x, go_on = joined.fabric, torch.randn(METHODS[name], FRAMES, SIZE), torch.zeros(2, dtype=torch.int)
+        single_process = start_svi(name)
+    two_processes, exchange_time, average = start_svi(name), [0.0], processes.average_gradients
+    fabric, x, go_on = two_processes.fabric, torch.randn(METHODS[name], FRAMES, SIZE), torch.zeros(2, dtype=torch.int)
 
-    def timed(*given: object) -> tuple[Tensor, Tensor | float]:
+    def timed(*arguments: object) -> tuple[Tensor, Tensor | float]:
         start = time.process_time()
         try:
-            return together(*given)  # type: ignore[arg-type]
+            return average(*arguments)  # type: ignore[arg-type]
         finally:
-            spent[0] += time.process_time() - start
+            exchange_time[0] += time.process_time() - start
 
     def turn(svi: dvae.SVI) -> tuple[float, float]:
-        """Seconds of the clock until both have come to its end, and of the processor."""
+        """Return wall seconds until both processes finish, and processor seconds."""
         processes.wait(fabric)
         start, busy = time.perf_counter(), time.process_time()
         for _ in range(steps):
@@ -89,30 +89,30 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
         processes.wait(fabric)
         start = time.perf_counter()
         for _ in range(steps if fabric.global_rank == 0 else 0):
-            alone.step(x)
+            single_process.step(x)
         return time.perf_counter() - start
 
     def exchange() -> float:
-        spent[0] = 0.0
-        _, busy = turn(joined)
-        return spent[0] / busy
+        exchange_time[0] = 0.0
+        _, busy = turn(two_processes)
+        return exchange_time[0] / busy
 
-    with mock.patch.object(processes, "together", timed):
-        found = [(one(), turn(joined)[0], turn(alone)[0], exchange()) for _ in range(turns)][2:]
+    with mock.patch.object(processes, "average_gradients", timed):
+        times = [(one(), turn(two_processes)[0], turn(single_process)[0], exchange()) for _ in range(turns)][2:]
     if fabric.global_rank == 0:
-        single, both, apart, share = (min(each) for each in zip(*found, strict=True))
-        rows = {"two processes": 2 * single / both, "two alone": 2 * single / apart, "exchange": share}
+        single, both, uncoupled, share = (min(each) for each in zip(*times, strict=True))
+        rows = {"two processes": 2 * single / both, "two alone": 2 * single / uncoupled, "exchange": share}
         print(json.dumps({f"{name}, {row}": value for row, value in rows.items()}))
 
 
 def two(name: str) -> dict[str, float]:
-    """Rows of a method in two processes."""
+    """Return the rows of a method in two processes."""
     command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", __spec__.name, name]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(done.stderr)
-    return dict(json.loads(done.stdout))
+    result = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, check=False)
+    if result.returncode:
+        raise RuntimeError(result.stderr)
+    return dict(json.loads(result.stdout))
 
 
 # ------------------------------------------------------------------------------------------------ sizes
@@ -125,10 +125,10 @@ def exponent(sizes: Sequence[int], action: Callable[[int], Callable[[], object]]
 
 
 def sizes(name: str) -> dict[str, float]:
-    """Exponents of a method's step."""
+    """Return the exponents of a method's training step."""
 
     def step(batch: int = 8, frames: int = FRAMES, size: int = SIZE, particles: int = 1) -> Callable[[], object]:
-        svi, x = begun(name, size, particles=particles), torch.randn(batch, frames, size)
+        svi, x = start_svi(name, size, particles=particles), torch.randn(batch, frames, size)
         return lambda: svi.step(x)
 
     return {
@@ -141,7 +141,7 @@ def sizes(name: str) -> dict[str, float]:
 
 def clips(name: str) -> dict[str, float]:
     """Return the exponents of a training step and of a validation over the number of clips."""
-    svi = begun(name)
+    svi = start_svi(name)
 
     def windows(count: int, split: str) -> motion.Windows:
         return motion.windows(motion.simulate(clips=count), motion.PROTOCOLS["simulated"], split)
@@ -163,9 +163,9 @@ def clips(name: str) -> dict[str, float]:
 def rows(_: torch.device) -> dict[str, float]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    found = {row: value for name in METHODS for row, value in (two(name) | sizes(name)).items()} | clips("srnn")
+    numbers = {row: value for name in METHODS for row, value in (two(name) | sizes(name)).items()} | clips("srnn")
     torch.set_num_threads(threads)
-    return found
+    return numbers
 
 
 if __name__ == "__main__":

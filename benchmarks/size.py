@@ -40,36 +40,36 @@ TARGETS = {
     "calls, forecast of hit-dvae": 1_435,
     "calls, table to forecasts": 456,
 }
-"""At most. Calls: half of what this script counted before the layout of November 2026."""
+"""Upper bounds. Those of calls are half of the counts before the layout of November 2026."""
 LAYOUT = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
 
 
 def lines(file: Path) -> int:
-    """Lines of code of a Python file."""
-    text, found = file.read_text(encoding="utf-8"), set[int]()
+    """Count the lines of code of a Python file."""
+    text, numbers = file.read_text(encoding="utf-8"), set[int]()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in LAYOUT:
-            found |= {*range(token.start[0], token.end[0] + 1)}
+            numbers |= {*range(token.start[0], token.end[0] + 1)}
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-            found -= {*range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1)}
-    return len(found)
+            numbers -= {*range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1)}
+    return len(numbers)
 
 
 def calls(run: Callable[[], object]) -> int:
-    """Calls from a file of the project to another one."""
+    """Count calls from a file of the project to another one."""
     parts, places, count = tuple(str(ROOT / part) + os.sep for part in SOURCE), dict[str, str](), 0
 
-    def seen(frame, event, _) -> None:
+    def trace(frame, event, _) -> None:
         nonlocal count
         if event == "call" and frame.f_back is not None:
-            ours, theirs = (
+            file, caller = (
                 places.setdefault(code.co_filename, os.path.realpath(code.co_filename))
                 for code in (frame.f_code, frame.f_back.f_code)
             )
-            count += ours != theirs and ours.startswith(parts) and theirs.startswith(parts)
+            count += file != caller and file.startswith(parts) and caller.startswith(parts)
 
-    sys.setprofile(seen)
+    sys.setprofile(trace)
     try:
         run()
     finally:
@@ -78,8 +78,8 @@ def calls(run: Callable[[], object]) -> int:
 
 
 def traced() -> dict[str, int]:
-    """Calls of two methods on the simulator's people."""
-    found, protocol = {}, dvae.motion.PROTOCOLS["simulated"]
+    """Count the calls of two methods on simulated motion, and of a table."""
+    counts, protocol = {}, dvae.motion.PROTOCOLS["simulated"]
     windows = dvae.motion.windows(dvae.motion.simulate(clips=8), protocol, "train")
     batch = windows.sample(4, torch.Generator().manual_seed(0))
     for name in ("srnn", "hit-dvae"):
@@ -91,9 +91,9 @@ def traced() -> dict[str, int]:
         def forecast(model=model) -> None:
             model.forecast({"x": batch["x"][:, : protocol.observed]}, protocol.predicted, 50)
 
-        for what, run in (("step", step), ("forecast", forecast)):
+        for name_of_run, run in (("step", step), ("forecast", forecast)):
             run()
-            found[f"calls, {what} of {name}"] = calls(run)
+            counts[f"calls, {name_of_run} of {name}"] = calls(run)
 
     def table() -> None:
         days = np.tile(range(20), 10)
@@ -102,25 +102,25 @@ def traced() -> dict[str, int]:
         with TemporaryDirectory() as folder:
             data.windows("test").forecast(dvae.method("srnn").build(data), 50).save(Path(folder) / "futures.csv")
 
-    return found | {"calls, table to forecasts": calls(table)}
+    return counts | {"calls, table to forecasts": calls(table)}
 
 
 def measured() -> dict[str, int]:
     """Return the number of each row."""
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
-    files = [path for path in map(Path, listed) if not (ROOT / path).is_symlink()]
-    own = Counter[str]()
+    paths = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    files = [path for path in map(Path, paths) if not (ROOT / path).is_symlink()]
+    lines_by_folder = Counter[str]()
     for path in files:
-        own[path.parts[0]] += lines(ROOT / path) if path.suffix == ".py" else 0
+        lines_by_folder[path.parts[0]] += lines(ROOT / path) if path.suffix == ".py" else 0
     folders = Counter(path.parent for path in files if path.suffix == ".py" and path.parts[0] in SOURCE)
     collected = subprocess.run(
         [sys.executable, "-m", "pytest", "--collect-only", "-q"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     return {
-        "lines of source": sum(own[part] for part in SOURCE),
-        "lines of tests": own["tests"],
+        "lines of source": sum(lines_by_folder[part] for part in SOURCE),
+        "lines of tests": lines_by_folder["tests"],
         "tests": sum("::" in line for line in collected.stdout.splitlines()),
-        "lines of benchmarks": own["benchmarks"],
+        "lines of benchmarks": lines_by_folder["benchmarks"],
         "files of stored scores": sum(path.is_relative_to("benchmarks/scores") for path in files),
         "files in the largest folder": max(folders.values()),
         "dependencies": len(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]),

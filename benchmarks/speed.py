@@ -63,7 +63,7 @@ FAMILY = {
 
 
 def seconds(*actions: Callable[[], object], repeat: int = 15) -> list[float]:
-    """The least time of each action, taken in turns."""
+    """Return the shortest time of each action; actions alternate."""
     clock = stopwatch()
     best = [math.inf] * len(actions)
     for action in actions:
@@ -88,20 +88,20 @@ def stopwatch() -> Callable[[], float]:
     return clock
 
 
-def moved(batch: Any, device: torch.device) -> Any:
-    """A batch on a device."""
+def to_device(batch: Any, device: torch.device) -> Any:
+    """Move a batch to a device."""
     return batch.map(lambda value: value.to(device))
 
 
 def layers(model: nn.Module, x: Tensor) -> Callable[[], None]:
-    """The LSTM layers of a model, forward and backward, on numbers for as many sequences and steps as x (B, T, D)."""
-    found = [module for module in model.modules() if isinstance(module, nn.LSTM)]
+    """Return the forward and backward passes of a model's LSTM layers, on random inputs of the size of x (B, T, D)."""
+    lstms = [module for module in model.modules() if isinstance(module, nn.LSTM)]
     options: Any = {"device": x.device, "requires_grad": True}
-    inputs = [torch.randn(*x.shape[:2], layer.input_size, **options) for layer in found]
+    inputs = [torch.randn(*x.shape[:2], layer.input_size, **options) for layer in lstms]
 
     def run() -> None:
-        for layer, given in zip(found, inputs, strict=True):
-            layer(given)[0].sum().backward()
+        for layer, value in zip(lstms, inputs, strict=True):
+            layer(value)[0].sum().backward()
 
     return run
 
@@ -123,13 +123,17 @@ class Products(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         if func.overloadpacket in self.KINDS:
-            given = [self.like(value) if isinstance(value, Tensor) else value for value in (*args, *kwargs.values())]
-            named = {name: value for name, value in zip(kwargs, given[len(args) :], strict=True) if name != "out"}
-            self.calls.append((func.overloadpacket.default, given[: len(args)], named))
+            arguments = [
+                self.like(value) if isinstance(value, Tensor) else value for value in (*args, *kwargs.values())
+            ]
+            keywords = {
+                name: value for name, value in zip(kwargs, arguments[len(args) :], strict=True) if name != "out"
+            }
+            self.calls.append((func.overloadpacket.default, arguments[: len(args)], keywords))
         return func(*args, **kwargs)
 
     def like(self, value: Tensor) -> Tensor:
-        """Of that shape and layout, the same for all of them."""
+        """Return a tensor with the shape and layout of a value; equal layouts share one."""
         key = tuple(value.shape), tuple(value.stride()), value.dtype
         if key not in self.made:
             self.made[key] = value.new_empty_strided(*key[:2]).fill_(0.5)
@@ -141,28 +145,28 @@ class Products(TorchDispatchMode):
             func(*args, **kwargs)
 
 
-class Held(TorchDispatchMode):
-    """Within it `most` is how many bytes there have been at once in tensors that operations have made."""
+class TensorMemory(TorchDispatchMode):
+    """Record in `peak` the largest number of bytes in tensors created within this mode."""
 
     def __init__(self) -> None:
         super().__init__()
         self.alive: dict[StorageWeakRef, int] = {}
-        self.most = 0
+        self.peak = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
-        given, made = (
+        inputs, outputs = (
             {StorageWeakRef(one.untyped_storage()): one for one in tree_leaves(tree) if isinstance(one, Tensor)}
             for tree in ((args, kwargs), out)
         )
-        self.alive |= {ref: made[ref].untyped_storage().nbytes() for ref in made.keys() - given.keys()}
+        self.alive |= {ref: outputs[ref].untyped_storage().nbytes() for ref in outputs.keys() - inputs.keys()}
         self.alive = {ref: size for ref, size in self.alive.items() if not ref.expired()}
-        self.most = max(self.most, sum(self.alive.values()))
+        self.peak = max(self.peak, sum(self.alive.values()))
         return out
 
 
 def products(action: Callable[[], object]) -> Callable[[], None]:
-    """The matrix products that an action makes, alone."""
+    """Return an action that repeats the matrix products of an action."""
     with Products() as noted:
         action()
     return noted.run
@@ -171,19 +175,19 @@ def products(action: Callable[[], object]) -> Callable[[], None]:
 def over_products(*actions: Callable[[], object], repeat: int = 3) -> list[float]:
     """Return the time of each action divided by the time of its matrix products."""
     times = seconds(*(each for action in actions for each in (action, products(action))), repeat=repeat)
-    return [whole / alone for whole, alone in zip(times[::2], times[1::2], strict=True)]
+    return [total / products_only for total, products_only in zip(times[::2], times[1::2], strict=True)]
 
 
 def step_of(model: Any, x: Tensor) -> Callable[[], None]:
-    """A training step by the ELBO."""
+    """Return a training step on the ELBO."""
     elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
     return training_step(model, lambda: evidence(elbo.terms(model, x), 0))
 
 
 def fed_step(method: Any, model: Any, windows: Any, size: int, device: torch.device, **program: Any) -> Any:
-    """A training step as a method has it, on so many windows; and what draws these."""
+    """Return a training step of a method on a batch of windows, and the function that draws batches."""
     recipe, elbo, generator = method.train(windows), dvae.SequenceELBO(), torch.Generator().manual_seed(0)
-    draw = lambda: moved(recipe.batches.sample(size, generator), device)  # noqa: E731
+    draw = lambda: to_device(recipe.batches.sample(size, generator), device)  # noqa: E731
     return training_step(model, lambda: recipe.objective(elbo.terms(model, draw(), **program), 0)), draw
 
 
@@ -199,7 +203,7 @@ def training_step(model: nn.Module, loss: Callable[[], Tensor]) -> Callable[[], 
 
 
 class ByHand(nn.Module):
-    """The SRNN of `models/family/srnn.py` as a page of torch, with nothing but what one training step needs."""
+    """The SRNN of `models/family/srnn.py` in plain torch, with only the operations of one training step."""
 
     def __init__(self, x: int, z: int, width: int = 64):
         super().__init__()
@@ -231,7 +235,7 @@ class ByHand(nn.Module):
 
 
 def program(x: Tensor) -> float:
-    """Pyro step over hand-written step."""
+    """Return the time of a Pyro step over a hand-written step."""
     model = dvae.method("srnn", latent=10).build({"x": SIZE}).to(x.device)
     by_hand = ByHand(SIZE, 10).to(x.device)
     a, b = seconds(step_of(model, x), training_step(by_hand, lambda: by_hand(x)))
@@ -239,7 +243,7 @@ def program(x: Tensor) -> float:
 
 
 def chain(x: Tensor) -> float:
-    """SRNN step with a plain loop over that with the fused chain."""
+    """Return the time of an SRNN step with a plain loop over the fused chain."""
     model = dvae.method("srnn", latent=10).build({"x": SIZE}).to(x.device)
     plain = copy.deepcopy(model)
     plain.encoder["z"].chain = lambda *_: None
@@ -248,7 +252,7 @@ def chain(x: Tensor) -> float:
 
 
 def cache(device: torch.device, length: int = 100, samples: int = 50) -> float:
-    """Time of recomputing over time of caching, for the same free run."""
+    """Return the time of free-running generation without caches over the time with caches."""
     model = dvae.method("hit-dvae", pose_width=8).build({"x": SIZE}).to(device).eval()
     parts = model.generator
 
@@ -268,7 +272,7 @@ def cache(device: torch.device, length: int = 100, samples: int = 50) -> float:
 
 
 def linear(device: torch.device) -> float:
-    """Exponent of T in the time of a training step."""
+    """Return the exponent of T in the time of a training step."""
     model = dvae.method("srnn").build({"x": SIZE}).to(device)
     lengths = [125, 250, 500, 1000]
     steps = [step_of(model, torch.randn(8, length, SIZE, device=device)) for length in lengths]
@@ -277,23 +281,23 @@ def linear(device: torch.device) -> float:
 
 
 def segments() -> float:
-    """Frames of segments of .7 to 1.6 seconds over the forward kinematics of so many poses, on one core."""
+    """Return the time of framing segments of 0.7 to 1.6 s over forward kinematics of as many poses, on one core."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     people = motion.simulate(clips=200, frames=50, seed=1).with_rotations()
     some = replace(people, clips=[clip.between(0, 20 + 3 * (n % 10)) for n, clip in enumerate(people)])
     view = motion.TimedFrames.of(some)
-    turns, places = view.poses(view.to(some)["x"].double())
+    rotations, places = view.poses(view.to(some)["x"].double())
     parents, offsets = people.skeleton.parents, people.skeleton.offsets
     a, b = seconds(
-        lambda: view.to(some), lambda: motion.geometry.kinematics.forward(parents, turns, offsets, places), repeat=5
+        lambda: view.to(some), lambda: motion.geometry.kinematics.forward(parents, rotations, offsets, places), repeat=5
     )
     torch.set_num_threads(threads)
     return a / b
 
 
 def filters(device: torch.device, steps: int = 10_000, batch: int = 1, size: int = 4) -> tuple[float, float]:
-    """Return the time of a Kalman chain in blocks over that step by step: forward, and with gradients."""
+    """Return the time of a Kalman chain in blocks over step by step: forward, and with gradients."""
     options: Any = {"device": device, "requires_grad": True}
     emission, one = 0.3 * torch.randn(steps, batch, 2 * size, size, device=device), torch.eye(size, device=device)
     chain = LinearGaussianChain(
@@ -321,16 +325,16 @@ def filters(device: torch.device, steps: int = 10_000, batch: int = 1, size: int
 
 
 def member(name: str, x: Tensor) -> float:
-    """Training step of a member of the family over its LSTM layers."""
+    """Return the time of a training step of a variant over its LSTM layers."""
     model = dvae.method(name, **FAMILY[name]).build({"x": SIZE}).to(x.device)
-    step, alone = seconds(step_of(model, x), layers(model, x))
-    return step / alone
+    step, lstm_time = seconds(step_of(model, x), layers(model, x))
+    return step / lstm_time
 
 
 def rows(device: torch.device) -> dict[str, float]:
     x = torch.randn(BATCH, STEPS, SIZE, device=device)
-    found = {"program": program(x), "chain": chain(x), "cache": cache(device), "linear": linear(device)}
+    numbers = {"program": program(x), "chain": chain(x), "cache": cache(device), "linear": linear(device)}
     if device.type == "cpu":
-        found["segments"] = segments()
-    found["filter"], found["filter-step"] = filters(device)
-    return found | {name: member(name, x) for name in FAMILY}
+        numbers["segments"] = segments()
+    numbers["filter"], numbers["filter-step"] = filters(device)
+    return numbers | {name: member(name, x) for name in FAMILY}

@@ -32,14 +32,14 @@ def rows(device: torch.device) -> dict[str, float]:
     batch = {name: value[:1].to(device) for name, value in windows.given(["RFoot", "LFoot"]).all().items()}
     past = {"x": batch["x"][:, :1], "y": batch["y"]}
     sampling = lambda: model.forecast(past, 100, 50)  # noqa: E731
-    found = dict(zip(("step", "sampling"), over_products(step, sampling), strict=True))
+    numbers = dict(zip(("step", "sampling"), over_products(step, sampling), strict=True))
 
     positions = windows.positions(batch["x"].cpu())[0].numpy()
     path = {"LWrist": positions[1:, windows.skeleton.find("LWrist")]}
     clock = stopwatch()
-    begun = clock()
+    start = clock()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the model is not fitted, and stretches bones
         model.complete(positions[0], path, samples=5, exact=True)
-    found["bend"] = clock() - begun
-    return found
+    numbers["bend"] = clock() - start
+    return numbers

@@ -1,4 +1,4 @@
-"""Write tables of what guides miss, what that costs, and of guides that miss nothing."""
+"""Write tables of missing dependencies of guides, their cost, and guides without missing dependencies."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,11 +14,11 @@ from .results import Table, write
 
 FAMILY: dict[str, tuple[str, str]] = settings(__file__)
 DERIVED = ("DKF", "SRNN", "DSAE", "HiT-DVAE", "two layers")
-"""Whose guides are derived, and their edges priced."""
+"""Models in the tables of derived guides and of edge costs."""
 
 
 def spread(cost: torch.Tensor) -> str:
-    """Mean, least and largest over random models."""
+    """Format the mean, minimum and maximum over random models."""
     mean, least, largest = (number(float(value)) for value in (cost.mean(), cost.min(), cost.max()))
     return f"{mean} ({least} to {largest})"
 
@@ -37,11 +37,11 @@ def edge_rows(names: Sequence[str], steps: int, seeds: int) -> Table:
 
 
 def row(name: str, generative: str, inference: str, steps: int, seeds: int) -> list[str]:
-    """A line of the table."""
+    """Return the row of a model and its guide."""
     audit = dvae.audit(generative, inference)
     missing, redundant = (
-        ", ".join(f"`{term}`" for terms in found.values() for term in terms) or "–"
-        for found in (audit.missing, audit.redundant)
+        ", ".join(f"`{term}`" for terms in terms_by_variable.values() for term in terms) or "–"
+        for terms_by_variable in (audit.missing, audit.redundant)
     )
     sizes = dict.fromkeys((*audit.generative.variables,), 1)
     cost = dvae.kl_gap(generative, inference, sizes, steps=steps, seeds=seeds)
@@ -53,8 +53,8 @@ def main(results: Path | None = None, steps: int = 5, seeds: int = 5) -> None:
 
     Args:
         results: folder of the tables, such as benchmarks/results; None prints them.
-        steps: of the sequences whose cost is computed.
-        seeds: models of random weights.
+        steps: length of the sequences.
+        seeds: number of models with random weights.
     """
     rows = [row(name, *equations, steps, seeds) for name, equations in FAMILY.items()]
     guides = Table(["", "model", "guide", "missing", "redundant", "cost"], rows)

@@ -1,4 +1,4 @@
-"""Write tables of runs of each method without `bones` and with it, evaluated on a part of their test windows.
+"""Write tables that compare runs with and without `bones` on a subset of their test windows.
 
 Results of a run are stored in its directory.
 """
@@ -21,7 +21,7 @@ COMPARED = ("ADE", "FDE", "APD", "limb-angle error")
 
 
 def evaluated(path: Path, every: int, samples: int) -> Path:
-    """The file with the scores of a run, on each so many-th of its test windows."""
+    """Score a run on every `every`-th test window, unless its file exists, and return the file."""
     file = path / f"{path.name}.json"
     if not file.exists():
         run = loaded(path)
@@ -35,14 +35,14 @@ def evaluated(path: Path, every: int, samples: int) -> Path:
 
 def joined(files: Sequence[Path]) -> dvae.Evaluation:
     """Join evaluations of single runs on the same windows, named by file, with the references of the first."""
-    found = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
-    first = next(iter(found.values()))
-    if any(same(each) != same(first) for each in found.values()):
+    evaluations = {file.stem.replace("-", " "): dvae.Evaluation.load(file) for file in files}
+    first = next(iter(evaluations.values()))
+    if any(same(each) != same(first) for each in evaluations.values()):
         sys.exit("these evaluations differ in windows, samples, seed, emission, multimodal threshold or metric models")
-    if len(found) < len(files):
-        sys.exit("two of these runs have one name; a row has the name of its directory")
+    if len(evaluations) < len(files):
+        sys.exit("two of these runs have the same name; rows are named after run directories, so rename one")
     rows = {name: row for name, row in first.rows.items() if not row.config}
-    for name, each in found.items():
+    for name, each in evaluations.items():
         (rows[name],) = (row for row in each.rows.values() if row.config)
     return replace(first, rows=rows)
 
@@ -56,17 +56,17 @@ def main(
     """Write the tables.
 
     Args:
-        runs: directories; each run without bones, and then the same with them.
+        runs: run directories in pairs: without bones, then with bones.
         results: folder of the tables, such as benchmarks/results; None prints them.
-        every: the test windows that are scored, each so many-th.
-        samples: futures of each.
+        every: stride over the test windows.
+        samples: number of futures of each window.
     """
     torch.set_num_threads(1)
     evaluation = joined([evaluated(path, every, samples) for path in runs])
     names = [name for name, row in evaluation.rows.items() if row.config]
     bones = [bool(evaluation.rows[name].config["bones"]) for name in names]
     if not names or bones != [False, True] * (len(names) // 2):
-        sys.exit("name each run without bones, and behind it the same with them")
+        sys.exit("name each run without bones, followed by the same run with bones")
     pairs = list(zip(names[::2], names[1::2], strict=True))
     rows = [
         [

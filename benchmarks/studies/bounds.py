@@ -1,4 +1,4 @@
-"""Write tables of what estimators of the evidence give where it is known."""
+"""Write tables of estimates of the evidence for models with known evidence."""
 
 from pathlib import Path
 
@@ -21,8 +21,10 @@ GUIDES = {
 TEMPERATURES = (10, 30, 100)
 
 
-def fitted(inference: str, steps: int, fitting: int, scale: float = 0.5) -> tuple[dvae.DynamicalVAE, dvae.Oracle]:
-    """The best guide of a factorization."""
+def fit_best_guide(
+    inference: str, steps: int, fitting: int, scale: float = 0.5
+) -> tuple[dvae.DynamicalVAE, dvae.Oracle]:
+    """Fit the best guide of a factorization; return the model and its oracle."""
     model = dvae.linear_gaussian_surrogate(MODEL, inference, {"z": 1, "x": 1}, steps, scale=scale)
     oracle = dvae.Oracle(model, steps)
     oracle.fit_guide(fitting)
@@ -31,21 +33,21 @@ def fitted(inference: str, steps: int, fitting: int, scale: float = 0.5) -> tupl
 
 
 def annealed(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> list[str]:
-    """Bounds from both sides minus the evidence."""
-    model, oracle = fitted(inference, steps, fitting)
-    drawn = model.sample(sequences, steps)
-    evidence = oracle.evidence(drawn["x"])
+    """Return a row of lower and upper bounds minus the evidence."""
+    model, oracle = fit_best_guide(inference, steps, fitting)
+    samples = model.sample(sequences, steps)
+    evidence = oracle.evidence(samples["x"])
     cells = []
     for temperatures in TEMPERATURES:
-        for start in (None, {"z": drawn["z"]}):
-            gap = dvae.annealed_bound(model, drawn["x"], temperatures, particles, latents=start).bound - evidence
+        for start in (None, {"z": samples["z"]}):
+            gap = dvae.annealed_bound(model, samples["x"], temperatures, particles, latents=start).bound - evidence
             cells.append(f"{gap.mean():.3f} ± {gap.std() / sequences**0.5:.3f}")
     return [f"`{inference}`, {name}", *cells]
 
 
 def row(name: str, inference: str, steps: int, sequences: int, particles: int, fitting: int) -> list[str]:
-    """Evidence minus each bound, for the best guide of the factorization."""
-    model, oracle = fitted(inference, steps, fitting)
+    """Return a row of the evidence minus each bound, for the best guide of the factorization."""
+    model, oracle = fit_best_guide(inference, steps, fitting)
     x = model.sample(sequences, steps)["x"]
     evidence = oracle.evidence(x)
     exact = (evidence - oracle.bound(x)).mean()
@@ -68,11 +70,11 @@ def main(
 
     Args:
         results: folder of the tables, such as benchmarks/results; None prints them.
-        steps: of a sequence.
-        sequences: over which is averaged.
-        particles: of IWAE and FIVO.
-        fitting: steps of the guide to its best.
-        sides: sequences of the table of bounds from both sides.
+        steps: length of a sequence.
+        sequences: number of sequences.
+        particles: number of particles of IWAE and FIVO.
+        fitting: number of training steps of the guide.
+        sides: number of sequences in the table of bounds from both sides.
     """
     head = ("guide", "ELBO (exact)", "IWAE", "FIVO, resampled below .25 K", "below .5 K", "always")
     estimates = Table(head, [row(*guide, steps, sequences, particles, fitting) for guide in GUIDES.items()])

@@ -1,13 +1,13 @@
-"""Fill the tables of docs/results from benchmarks/results, as the file cards.toml says.
+"""Fill the tables of docs/results from benchmarks/results, as specified in cards.toml.
 
-    [hit_dvae.main]                       # between the marks of the table "main" in docs/results/hit_dvae.md
-    source = "hit_dvae/scores"            # or several: a cell is from the first one with its row and column
-    rows = ["hit-dvae", "gsps"]           # by their first cells; without it, all rows
-    columns = { "ADE (m) ↓" = "ADE" }     # header in the card = header in the source, arrows apart
+    [hit_dvae.main]                       # table between the marks "main" in docs/results/hit_dvae.md
+    source = "hit_dvae/scores"            # or a list: the first with the row and the column counts
+    rows = ["hit-dvae", "gsps"]           # first cells of the rows; all rows by default
+    columns = { "ADE (m) ↓" = "ADE" }     # header in the card = header in the source without ↓ and ↑
 
-Rows may be named: { "4 paths" = ["trajevae", "4"] } is the row that begins with these cells. A column may have a source
-of its own: { "CMU" = ["index/cmu8", "ADE"] }. A cell has one error, the total: of `score ± a ± b` it is the root of
-a² + b². A column has the fewest decimals of its cells.
+Rows may have names: { "4 paths" = ["trajevae", "4"] } is the row that begins with these cells. A column may have
+its own source: { "CMU" = ["index/cmu8", "ADE"] }. Cells show the total error: `score ± a ± b` becomes
+`score ± sqrt(a² + b²)`. All cells of a column have the fewest decimals that one of them has.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def aligned(cells: Sequence[str]) -> list[str]:
     return [with_total(cell, decimals) if number else cell for cell, number in zip(cells, numbers, strict=True)]
 
 
-def found(source: str, row: Sequence[str], column: str) -> str | None:
+def find_cell(source: str, row: Sequence[str], column: str) -> str | None:
     """Return the cell of a source; None if it has no such row or no such column.
 
     Raises:
@@ -71,23 +71,24 @@ def card(
     """
     sources = [source] if isinstance(source, str) else source
     rows = rows or [line[0] for line in read(sources[0]).rows]
-    named = rows if isinstance(rows, Mapping) else {row: row for row in rows}
-    made = []
-    for where in columns.values():
-        tables, column = (sources, where) if isinstance(where, str) else ([where[0]], where[1])
+    names = rows if isinstance(rows, Mapping) else {row: row for row in rows}
+    columns_of_cells = []
+    for location in columns.values():
+        tables, column = (sources, location) if isinstance(location, str) else ([location[0]], location[1])
         cells = [
-            [found(table, [row] if isinstance(row, str) else row, column) for table in tables] for row in named.values()
+            [find_cell(table, [row] if isinstance(row, str) else row, column) for table in tables]
+            for row in names.values()
         ]
-        made.append([next((cell for cell in each if cell is not None), "") for each in cells])
-    lines = dict(zip(named, zip(*made, strict=True), strict=True))
-    for what, lists in ("row", lines), ("column", dict(zip(columns, made, strict=True))):
+        columns_of_cells.append([next((cell for cell in each if cell is not None), "") for each in cells])
+    lines = dict(zip(names, zip(*columns_of_cells, strict=True), strict=True))
+    for kind, lists in ("row", lines), ("column", dict(zip(columns, columns_of_cells, strict=True))):
         if missing := [name for name, cells in lists.items() if not any(cells)]:
-            raise ValueError(f"no source has the {what} {', '.join(missing)}")
-    shown = zip(*([cell or "–" for cell in aligned(cells)] for cells in made), strict=True)
-    return Table(["", *columns], [[name, *cells] for name, cells in zip(named, shown, strict=True)])
+            raise ValueError(f"no source has the {kind} {', '.join(missing)}")
+    printed = zip(*([cell or "–" for cell in aligned(cells)] for cells in columns_of_cells), strict=True)
+    return Table(["", *columns], [[name, *cells] for name, cells in zip(names, printed, strict=True)])
 
 
-def filled(page: str, tables: Mapping[str, Any]) -> str:
+def fill_page(page: str, tables: Mapping[str, Any]) -> str:
     """Return the text of a page with its tables between their marks.
 
     Raises:
@@ -97,8 +98,8 @@ def filled(page: str, tables: Mapping[str, Any]) -> str:
     marked = re.findall(r"<!-- table: (.*) -->", text)
     if sorted(marked) != sorted(tables):
         raise ValueError(f"{page}.md has marks for {marked}, cards.toml tables for {[*tables]}")
-    for name, told in tables.items():
-        block = f"<!-- table: {name} -->\n\n{card(**told).markdown()}\n<!-- end of table -->"
+    for name, options in tables.items():
+        block = f"<!-- table: {name} -->\n\n{card(**options).markdown()}\n<!-- end of table -->"
         marks = f"<!-- table: {re.escape(name)} -->.*?<!-- end of table -->"
         text = re.sub(marks, lambda _, block=block: block, text, flags=re.DOTALL)
     return text
@@ -108,7 +109,7 @@ def main() -> None:
     """Fill all tables."""
     for page, tables in CARDS.items():
         try:
-            text = filled(page, tables)
+            text = fill_page(page, tables)
         except (ValueError, OSError) as error:
             sys.exit(str(error))
         (DOCS / "results" / f"{page}.md").write_text(text, encoding="utf-8")

@@ -47,29 +47,29 @@ from dvae.motion.segments.completion import (
 from dvae.motion.segments.dataset import SegmentData, subsample_clips
 from dvae.motion.segments.embodied import SHAPE, Segments
 
-from .engine import OURS, Row, fitted, folder, interval, kept, read_all, spread
+from .engine import OURS, Row, fit_or_load, folder, interval, read_all, read_or_measure, spread
 from .results import DOCS, Table, refuse_unknown, tabled, write
 
 PARTS = ("prediction", "completion", "uncertainty", "tuning")
 TUNING = "tuning"
 DEVIATIONS, DESCENT = Deviations(), dvae.Descent()
-"""Chosen by the part "tuning"."""
+"""Defaults that the part "tuning" selected."""
 SECONDS, HORIZON = 0.25, 1.2
 RESIDUAL: dict[str, Any] = {"alpha": 0.0, "velocity": True, "width": 256}
 TRAINING: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5}
-UNTOLD, SUP, STILL, NEAR = "ours, body unknown", "residual-sup", "last frame held", "reconstruction"
+BODY_UNKNOWN, SUP, STILL, NEAR = "ours, body unknown", "residual-sup", "last frame held", "reconstruction"
 POINTS, FRAMES = (10, 50, 100), (5, 10, 20, 50, 100)
 FEW, ALL = 50, FRAMES[-1]
-"""Points a frame where the number of frames changes, and frames where that of points does."""
+"""Fixed number of points a frame in the series over frames, and of frames in the series over points."""
 LEVELS = (0.5, 0.8, 0.95)
 DRAWS = 200
 ENDS = ("left", "behind", "bent")
 THIN = 16
-"""Of so many vertices one has intervals, in one frame of so many; neighbours err alike."""
+"""Stride over vertices and frames for intervals, because neighbours have similar errors."""
 AT_ONCE = 512
-"""Draws to hold at once."""
+"""Number of draws in memory at the same time."""
 CONVERGED = 0.1
-"""Nats that a step of Newton's would still gain, and within which two starts are taken for arrived at one place."""
+"""Largest gain of a further Newton step, and largest difference of two starts that agree, in nats."""
 
 
 @dataclass(frozen=True)
@@ -109,14 +109,16 @@ class Sight:
         return f"{self.points} points, {self.frames} frames{', markers' * self.markers}"
 
     def of(self, model: Any, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """In the first, the last, and frames evenly between, at times that are known; of bodies nothing is."""
+        """Simulate observations at known times in evenly spaced frames; body shapes are not observed."""
         x, last = batch[WHOLE], model.timed.frames - 1
         frames = torch.linspace(0, last, self.frames).round().long()
         kinds = ["points"] * bool(self.points) + ["markers"] * self.markers
-        seen = {"times": model.timed.times(x)[:, frames]}
+        observations = {"times": model.timed.times(x)[:, frames]}
         for kind in kinds:
-            seen |= simulate_observations(model, x, batch[SHAPE], kind, frames=frames.tolist(), points=self.points)
-        return seen
+            observations |= simulate_observations(
+                model, x, batch[SHAPE], kind, frames=frames.tolist(), points=self.points
+            )
+        return observations
 
 
 @dataclass(frozen=True)
@@ -124,19 +126,19 @@ class Beginning:
     """Observation of the whole surface in the first quarter of a second.
 
     Args:
-        told: whether body shapes are given.
+        with_shape: whether body shapes are given.
     """
 
-    told: bool = True
+    with_shape: bool = True
 
     def __str__(self) -> str:
-        return f"first {SECONDS} s{'' if self.told else ', body unknown'}"
+        return f"first {SECONDS} s{'' if self.with_shape else ', body unknown'}"
 
     def of(self, model: Any, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """At the rate of the data."""
+        """Simulate observations of the surface at the frame rate of the data."""
         fps = model.timed.skeleton.fps
-        seen = simulate_observations(model, batch[WHOLE], batch[SHAPE], "surfaces", fps=fps, seconds=SECONDS)
-        return {**seen, SHAPE: batch[SHAPE]} if self.told else seen
+        observations = simulate_observations(model, batch[WHOLE], batch[SHAPE], "surfaces", fps=fps, seconds=SECONDS)
+        return {**observations, SHAPE: batch[SHAPE]} if self.with_shape else observations
 
 
 SIGHTS = {
@@ -144,34 +146,34 @@ SIGHTS = {
     "frames": [Sight(FEW, frames, markers) for frames in FRAMES for markers in (False, True)],
     "markers": [Sight(0, frames, True) for frames in FRAMES],
 }
-SURE = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
-"""Of which intervals are judged, and deviations chosen, each one of a kind."""
-TRIED = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02, 0.05, 0.1)}
-TRIED |= {"point": (0.05, 0.1, 0.2)}
-KINDS = dict(zip(map(str, SURE), ("surface", "marker", "point"), strict=True))
+UNCERTAINTY_CASES = [Beginning(), Sight(0, 10, True), Sight(FEW, 20)]
+"""Observations for the coverage of intervals and for the tuning of deviations, one of each kind."""
+TUNED_DEVIATIONS = {"surface": (0.005, 0.01, 0.02, 0.05, 0.1), "marker": (0.005, 0.01, 0.02, 0.05, 0.1)}
+TUNED_DEVIATIONS |= {"point": (0.05, 0.1, 0.2)}
+KINDS = dict(zip(map(str, UNCERTAINTY_CASES), ("surface", "marker", "point"), strict=True))
 PRIORS = {"aggregate": True, "standard": False}
-"""That of known segments, and N(0, I)."""
+"""Whether the prior is the aggregate posterior of training segments, by name; otherwise it is N(0, I)."""
 DESCENTS = [dvae.Descent(100, 0.05, 1), dvae.Descent(100, 0.05), dvae.Descent(100, 0.1), dvae.Descent(200, 0.05)]
 DESCENTS += [dvae.Descent(200, 0.1), dvae.Descent(400, 0.05), dvae.Descent(200, 0.05, 8), dvae.Descent(400, 0.1)]
 
 
 @cache
-def opened(path: Path | None) -> SegmentData:
-    """Segments of a file."""
+def open_segments(path: Path | None) -> SegmentData:
+    """Open a file of segments; end the script if there is none."""
     if path is None:
-        sys.exit("something has not been measured yet; name the data and a run")
+        sys.exit("some measurements are missing; pass the data and a run")
     return SegmentData.open(path)
 
 
-def grouped(people: motion.MotionSet) -> motion.MotionSet:
-    """Segments of file group A for training, of B for test."""
+def split_by_group(people: motion.MotionSet) -> motion.MotionSet:
+    """Split segments: file group A for training, group B for test."""
     splits = {"A": "train", "B": "test"}
     clips = [replace(clip, split=splits.get(clip.labels["file_group"], "unseen")) for clip in people]
     return replace(people, clips=clips)
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class EvaluatedRun:
     """A run and its test segments, read on first use.
 
     Args:
@@ -190,17 +192,17 @@ class Held:
 
     @cached_property
     def model(self) -> Any:
-        """That was fitted."""
+        """The fitted model."""
         return dvae.load(self.path).model
 
     def split(self, name: str) -> list[Any]:
-        """Segments of a part."""
-        people = opened(self.data).segments
-        return [clip for clip in (grouped(people) if self.grouped else people) if clip.split == name]
+        """Return the segments of a split."""
+        people = open_segments(self.data).segments
+        return [clip for clip in (split_by_group(people) if self.grouped else people) if clip.split == name]
 
     def seen(self, clips: Sequence[Any]) -> Segments:
-        """Segments as the model sees them."""
-        return Segments(replace(opened(self.data).segments, clips=clips), self.model.timed)
+        """Return segments with the time frames of the model."""
+        return Segments(replace(open_segments(self.data).segments, clips=clips), self.model.timed)
 
     @cached_property
     def segments(self) -> Segments:
@@ -210,91 +212,94 @@ class Held:
 
     @cached_property
     def batch(self) -> Mapping[str, Tensor]:
-        """All of them."""
+        """All test segments."""
         return self.segments.all()
 
     def complete(
-        self, seen: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
+        self, observations: Mapping[str, Tensor], deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
     ) -> Completed:
-        """Complete segments from observations, with known segments for training."""
-        known = self.seen(subsample_clips(self.split("train"), self.budget.known)).all()
-        how: dict[str, Any] = {"deviations": deviations, "descent": descent, "aggregate": aggregate}
-        return complete(self.model, seen, **how, known=known)
+        """Complete segments from observations; training segments give the prior and the starts."""
+        training = self.seen(subsample_clips(self.split("train"), self.budget.known)).all()
+        options: dict[str, Any] = {"deviations": deviations, "descent": descent, "aggregate": aggregate}
+        return complete(self.model, observations, **options, known=training)
 
 
-def scored(held: Held, rows: Mapping[str, Any], **more: Any) -> dict[str, Any]:
-    """A measurement of scores by segment, which are of takes."""
-    takes = [clip.labels["source"] for clip in held.segments.motion]
+def scores_by_take(run: EvaluatedRun, rows: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+    """Return a measurement with scores by segment, grouped by take."""
+    takes = [clip.labels["source"] for clip in run.segments.motion]
     return {"clips": takes, "weights": [1] * len(takes), "rows": rows, **more}
 
 
 def millimetres(values: Tensor) -> list[Any]:
-    """Of metres, to a hundredth."""
+    """Convert metres to millimetres, rounded to two decimals."""
     return (1000 * values.double()).round(decimals=2).tolist()  # type: ignore[no-any-return]
 
 
 # Prediction
 
 
-def moments(fps: float) -> tuple[list[float], int]:
-    """Times of frames up to the horizon, and how many of them are seen."""
+def observed_times(fps: float) -> tuple[list[float], int]:
+    """Return the times of the frames up to the horizon, and the number of observed frames."""
     return [n / fps for n in range(int(HORIZON * fps + 1e-3) + 1)], int(SECONDS * fps + 1e-3) + 1
 
 
 def at(time: float) -> str:
-    """The name of errors at a time."""
+    """Return the name of the errors at a time."""
     return f"{time:.3f} s"
 
 
-def by_times(times: Sequence[float], errors: Sequence[Tensor]) -> dict[str, list[Any]]:
-    """Errors by time and segment, of errors (T,) of each segment, NaN behind its end."""
-    return dict(zip(map(at, times), millimetres(torch.stack([*errors], 1)), strict=True))
+def errors_by_time(times: Sequence[float], segment_errors: Sequence[Tensor]) -> dict[str, list[Any]]:
+    """Arrange errors (T,) of each segment by time and segment; NaN marks times after the end."""
+    return dict(zip(map(at, times), millimetres(torch.stack([*segment_errors], 1)), strict=True))
 
 
-def errors(held: Held, made: tuple[Tensor, Tensor], times: Sequence[float]) -> dict[str, list[Any]]:
-    """Errors by time and segment of frames and bodies."""
-    truth = held.batch[WHOLE], held.batch[SHAPE]
-    pairs = [[tuple(each[n : n + 1] for each in side) for side in (made, truth)] for n in range(len(made[0]))]
-    return by_times(times, [error_by_time(held.model, *pair, times)[0] for pair in pairs])
+def errors_of(run: EvaluatedRun, predicted: tuple[Tensor, Tensor], times: Sequence[float]) -> dict[str, list[Any]]:
+    """Return errors by time and segment of predicted frames and body shapes."""
+    truth = run.batch[WHOLE], run.batch[SHAPE]
+    pairs = [[tuple(each[n : n + 1] for each in side) for side in (predicted, truth)] for n in range(len(predicted[0]))]
+    return errors_by_time(times, [error_by_time(run.model, *pair, times)[0] for pair in pairs])
 
 
-def prediction(held: Held) -> dict[str, Any]:
+def measure_prediction(run: EvaluatedRun) -> dict[str, Any]:
     """Return errors by time of predictions and of reconstructions of whole segments."""
-    model, batch = held.model, held.batch
-    times, _ = moments(held.segments.motion.skeleton.fps)
-    found = {}
-    for name, sight in ((OURS, Beginning()), (UNTOLD, Beginning(told=False))):
-        done = held.complete(sight.of(model, batch), DEVIATIONS, DESCENT)
-        found[name] = errors(held, (done.x, done.shape), times)
+    model, batch = run.model, run.batch
+    times, _ = observed_times(run.segments.motion.skeleton.fps)
+    rows = {}
+    for name, sight in ((OURS, Beginning()), (BODY_UNKNOWN, Beginning(with_shape=False))):
+        completed = run.complete(sight.of(model, batch), DEVIATIONS, DESCENT)
+        rows[name] = errors_of(run, (completed.x, completed.shape), times)
     with torch.no_grad():
         near = model.decode(model.encode(batch), batch[SHAPE])
-    found[NEAR] = errors(held, (near, batch[SHAPE]), times)
-    return scored(held, found, times=times)
+    rows[NEAR] = errors_of(run, (near, batch[SHAPE]), times)
+    return scores_by_take(run, rows, times=times)
 
 
-def recurrent(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
-    """Residual-sup, fitted, or gone on with where it was stopped."""
+def fit_residual(data: SegmentData, seed: int, out: Path, steps: int) -> Any:
+    """Fit residual-sup, or resume its run."""
     segments = data.segments
     sources = {clip.labels["source"] for clip in segments if clip.split == "train"}
     takes = bodies.fit_to_body(data.motion, bodies.human())
     takes = replace(takes, clips=[clip for clip in takes if clip.split == "train" and clip.name in sources])
-    opened = motion.MotionData(str(data.path), takes, protocol(takes.skeleton.fps))
+    takes_data = motion.MotionData(str(data.path), takes, protocol(takes.skeleton.fps))
     training = {"steps": steps, "validate_every": max(steps // 3, 1), **TRAINING}
     method = dvae.method("mix-and-match", **RESIDUAL)
-    return fitted(method, opened, opened.windows("train"), out=out, seed=seed, **training).model.eval()
+    return fit_or_load(method, takes_data, takes_data.windows("train"), out=out, seed=seed, **training).model.eval()
 
 
 def protocol(fps: float) -> motion.Protocol:
     """Return the protocol of windows up to the horizon, rotated to face ahead in the last observed frame."""
-    times, seen = moments(fps)
+    times, observed = observed_times(fps)
     options: dict[str, Any] = {"root": "relative", "heading": True, "representation": "quaternion", "validation": 0.0}
-    return motion.Protocol(SUP, seen, len(times) - seen, fps, train_stride=1, test_stride=100_000, **options)
+    return motion.Protocol(SUP, observed, len(times) - observed, fps, train_stride=1, test_stride=100_000, **options)
 
 
-def turned(model: Any, people: motion.MotionSet) -> tuple[Tensor, Tensor]:
-    """What residual-sup makes of the first frames of segments: rotations (N, H, J, 3, 3) and places (N, H, 3).
+def residual_poses(model: Any, people: motion.MotionSet) -> tuple[Tensor, Tensor]:
+    """Predict poses with residual-sup from the first frames of segments.
 
-    As frames of chi are, from where a segment starts, facing heading zero.
+    Poses have the coordinates of chi: they start at the origin, with heading zero.
+
+    Returns:
+        Rotations (N, H, J, 3, 3) and root positions (N, H, 3).
     """
     skeleton = people.skeleton
     cut = protocol(skeleton.fps)
@@ -314,211 +319,215 @@ def turned(model: Any, people: motion.MotionSet) -> tuple[Tensor, Tensor]:
     return rotations, rotate_about_up(places, angle, skeleton.up)
 
 
-def references(held: Held, model: Any) -> dict[str, Any]:
-    """Errors by time of residual-sup, and of the last frame that was seen, held."""
-    batch, people = held.batch, held.segments.motion
-    times, seen = moments(people.skeleton.fps)
-    found: dict[str, list[Any]] = {SUP: [], STILL: []}
-    rotations, places = turned(model, people)
+def reference_errors(run: EvaluatedRun, model: Any) -> dict[str, Any]:
+    """Return errors by time of residual-sup and of the repeated last observed frame."""
+    batch, people = run.batch, run.segments.motion
+    times, observed = observed_times(people.skeleton.fps)
+    errors: dict[str, list[Any]] = {SUP: [], STILL: []}
+    rotations, places = residual_poses(model, people)
     for n in range(len(people)):
         x, shape = (batch[name][n : n + 1] for name in (WHOLE, SHAPE))
-        truth = surfaces_at(held.model, x, shape, torch.tensor(times)[None])[0]
-        made = held.model.body(shape, rotations[n : n + 1], places[n : n + 1])[0][0]
-        still = truth[seen - 1 : seen].expand(len(times) - seen, -1, -1)
-        for name, ahead in ((SUP, made), (STILL, still)):
-            whole = torch.cat([truth[:seen], ahead])
-            found[name].append(bodies.vertex_error(whole[:, None], truth[:, None]))
-    return scored(held, {name: by_times(times, rows) for name, rows in found.items()}, times=times)
+        truth = surfaces_at(run.model, x, shape, torch.tensor(times)[None])[0]
+        predicted = run.model.body(shape, rotations[n : n + 1], places[n : n + 1])[0][0]
+        still = truth[observed - 1 : observed].expand(len(times) - observed, -1, -1)
+        for name, ahead in ((SUP, predicted), (STILL, still)):
+            surfaces = torch.cat([truth[:observed], ahead])
+            errors[name].append(bodies.vertex_error(surfaces[:, None], truth[:, None]))
+    return scores_by_take(run, {name: errors_by_time(times, rows) for name, rows in errors.items()}, times=times)
 
 
-def beside(held: Held, seed: int, out: Path) -> dict[str, Any]:
-    """Fits residual-sup, and measures the references."""
-    return references(held, recurrent(opened(held.data), seed, out, held.budget.steps))
+def measure_references(run: EvaluatedRun, seed: int, out: Path) -> dict[str, Any]:
+    """Fit residual-sup and measure the references."""
+    return reference_errors(run, fit_residual(open_segments(run.data), seed, out, run.budget.steps))
 
 
 # Completion
 
 
-def completed(held: Held, sight: Sight) -> dict[str, Any]:
-    """How near completed surfaces are to true ones, in millimetres by segment, and how descents ended."""
-    model, batch = held.model, held.batch
-    seen = sight.of(model, batch)
-    done = held.complete(seen, DEVIATIONS, DESCENT)
-    found: dict[str, list[Tensor]] = {"chamfer": [], "floor": [], "vertices": [], "seen": []}
+def measure_completion(run: EvaluatedRun, sight: Sight) -> dict[str, Any]:
+    """Return distances of completed from true surfaces by segment, in millimetres, and the convergence of descents."""
+    model, batch = run.model, run.batch
+    observations = sight.of(model, batch)
+    completed = run.complete(observations, DEVIATIONS, DESCENT)
+    distances: dict[str, list[Tensor]] = {"chamfer": [], "floor": [], "vertices": [], "seen": []}
     generator = torch.Generator().manual_seed(0)
-    frames = seen["frames"][0].long()
+    frames = observations["frames"][0].long()
     for n in range(len(batch[WHOLE])):
         one = slice(n, n + 1)
-        made, truth = model.vertices(done.x[one], done.shape[one]), model.vertices(batch[WHOLE][one], batch[SHAPE][one])
-        points = sample_surfaces(truth, model.body.faces, held.budget.dense, generator)
-        found["chamfer"].append(chamfer(points, made).mean(-1))
-        found["floor"].append(chamfer(points, truth).mean(-1))
-        found["vertices"].append(bodies.vertex_error(made, truth))
+        predicted = model.vertices(completed.x[one], completed.shape[one])
+        truth = model.vertices(batch[WHOLE][one], batch[SHAPE][one])
+        points = sample_surfaces(truth, model.body.faces, run.budget.dense, generator)
+        distances["chamfer"].append(chamfer(points, predicted).mean(-1))
+        distances["floor"].append(chamfer(points, truth).mean(-1))
+        distances["vertices"].append(bodies.vertex_error(predicted, truth))
         if sight.points:
-            found["seen"].append(chamfer(seen["points"][one], made[:, frames]).mean(-1))
-    lasts = model.timed.lasts(done.x) - model.timed.lasts(batch[WHOLE])
-    scores = {name: millimetres(torch.cat(each)) for name, each in found.items() if each}
-    return scored(held, {OURS: {**scores, "duration": millimetres(lasts.abs()), **ended(done)}})
+            distances["seen"].append(chamfer(observations["points"][one], predicted[:, frames]).mean(-1))
+    lasts = model.timed.lasts(completed.x) - model.timed.lasts(batch[WHOLE])
+    scores = {name: millimetres(torch.cat(each)) for name, each in distances.items() if each}
+    return scores_by_take(run, {OURS: {**scores, "duration": millimetres(lasts.abs()), **convergence(completed)}})
 
 
-def ended(done: Completed) -> dict[str, Any]:
+def convergence(completed: Completed) -> dict[str, Any]:
     """Return three measures of convergence: nats to gain by a Newton step, nats between two starts, and `bent`."""
-    posterior = done.posterior
+    posterior = completed.posterior
     behind = posterior.behind[1] if len(posterior.behind) > 1 else torch.full_like(posterior.energy, torch.nan)
     return dict(zip(ENDS, (each.tolist() for each in (posterior.left, behind, posterior.bent)), strict=True))
 
 
-def certain(
-    held: Held, sight: Any, deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
+def measure_coverage(
+    run: EvaluatedRun, sight: Any, deviations: Deviations, descent: dvae.Descent, aggregate: bool = True
 ) -> dict[str, Any]:
     """Return, by segment, the coverage of intervals for vertices and durations, and the errors.
 
     Intervals are normal, with the mean and variance of draws. They are for the surface, the surface with its noise,
     and, if the end is not observed, the duration with the deviation of times.
     """
-    model, batch = held.model, held.batch
-    done = held.complete(sight.of(model, batch), deviations, descent, aggregate)
-    khat = done.evidence(DRAWS, chunk=AT_ONCE).khat
-    x, shapes = done.draw(DRAWS)
-    which, noise = torch.arange(0, len(model.body.template), THIN), getattr(deviations, KINDS[str(sight)])
+    model, batch = run.model, run.batch
+    completed = run.complete(sight.of(model, batch), deviations, descent, aggregate)
+    khat = completed.evidence(DRAWS, chunk=AT_ONCE).khat
+    x, shapes = completed.draw(DRAWS)
+    vertices_used, noise = torch.arange(0, len(model.body.template), THIN), getattr(deviations, KINDS[str(sight)])
     reach = torch.distributions.Normal(0.0, 1.0).icdf((1 + torch.tensor(LEVELS)) / 2)[:, None]
 
     def places(frames: Tensor, shape: Tensor) -> Tensor:
-        """(..., P) of some vertices in some frames."""
+        """Return the coordinates (..., P) of every `THIN`-th vertex in every `THIN`-th frame."""
         rotations, translation = model.timed.poses(frames[..., ::THIN, :])
-        found: Tensor = model.body.some(shape, rotations, translation, which)
-        return found.flatten(-3)
+        deviations_mm: Tensor = model.body.some(shape, rotations, translation, vertices_used)
+        return deviations_mm.flatten(-3)
 
-    def within(drawn: Tensor, truth: Tensor, noise: float = 0.0) -> Tensor:
-        """Shares of the truth (P,) that intervals of draws (n, P) hold, by level."""
-        spread = (drawn.var(0) + noise**2).sqrt()
-        return ((truth - drawn.mean(0)).abs() <= reach * spread).float().mean(-1)
+    def within(samples: Tensor, truth: Tensor, noise: float = 0.0) -> Tensor:
+        """Return the share of true values (P,) inside the intervals of draws (n, P), by level."""
+        spread = (samples.var(0) + noise**2).sqrt()
+        return ((truth - samples.mean(0)).abs() <= reach * spread).float().mean(-1)
 
-    found: dict[str, list[Any]] = {"spread": [], "error": []}
-    told = ("surface", "seen", *(() if isinstance(sight, Sight) else ("duration",)))
-    shares: dict[str, list[Tensor]] = {what: [] for what in told}
+    deviations_mm: dict[str, list[Any]] = {"spread": [], "error": []}
+    quantities = ("surface", "seen", *(() if isinstance(sight, Sight) else ("duration",)))
+    shares: dict[str, list[Tensor]] = {quantity: [] for quantity in quantities}
     for n in range(len(x[0])):
-        drawn, truth = places(x[:, n], shapes[:, n]), places(batch[WHOLE][n], batch[SHAPE][n])
+        samples, truth = places(x[:, n], shapes[:, n]), places(batch[WHOLE][n], batch[SHAPE][n])
         if "duration" in shares:
             lasts, last = (model.timed.lasts(frames)[..., None] for frames in (x[:, n], batch[WHOLE][n]))
             shares["duration"].append(within(lasts, last, deviations.time))
-        shares["surface"].append(within(drawn, truth))
-        shares["seen"].append(within(drawn, truth, noise))
-        found["spread"].append(1000 * float(drawn.var(0).mean().sqrt()))
-        found["error"].append(1000 * float((drawn.mean(0) - truth).square().mean().sqrt()))
-    made, theirs = (model.vertices(*each) for each in ((done.x, done.shape), (batch[WHOLE], batch[SHAPE])))
-    held_by = {
-        holds(what, level): (100 * share).tolist()
-        for what, each in shares.items()
+        shares["surface"].append(within(samples, truth))
+        shares["seen"].append(within(samples, truth, noise))
+        deviations_mm["spread"].append(1000 * float(samples.var(0).mean().sqrt()))
+        deviations_mm["error"].append(1000 * float((samples.mean(0) - truth).square().mean().sqrt()))
+    predicted, true_surfaces = model.vertices(completed.x, completed.shape), model.vertices(batch[WHOLE], batch[SHAPE])
+    coverages = {
+        coverage_name(quantity, level): (100 * share).tolist()
+        for quantity, each in shares.items()
         for level, share in zip(LEVELS, torch.stack(each, 1), strict=True)
     }
-    vertices = millimetres(bodies.vertex_error(made, theirs))
-    return scored(held, {OURS: {"khat": khat.tolist(), "vertices": vertices, **found, **held_by, **ended(done)}})
+    vertices = millimetres(bodies.vertex_error(predicted, true_surfaces))
+    return scores_by_take(
+        run,
+        {OURS: {"khat": khat.tolist(), "vertices": vertices, **deviations_mm, **coverages, **convergence(completed)}},
+    )
 
 
-def holds(what: str, level: float) -> str:
-    """The name of how much intervals of a level hold, in per cent."""
-    return f"{what}, {100 * level:.0f} % (%)"
+def coverage_name(quantity: str, level: float) -> str:
+    """Return the name of the coverage of intervals of a level, in per cent."""
+    return f"{quantity}, {100 * level:.0f} % (%)"
 
 
 # Tables
 
 
-def curves(out: Path) -> dict[str, Row]:
+def error_rows(out: Path) -> dict[str, Row]:
     """Return the rows with errors by time."""
     ours, others = (read_all(out, name) for name in ("prediction", "references"))
-    named = {OURS: ours, UNTOLD: ours, NEAR: ours, SUP: others, STILL: others}
-    return {name: replace(row, name=name) for name, row in named.items() if row is not None}
+    rows = {OURS: ours, BODY_UNKNOWN: ours, NEAR: ours, SUP: others, STILL: others}
+    return {name: replace(row, name=name) for name, row in rows.items() if row is not None}
 
 
-def by_time(drawn: Mapping[str, Row]) -> Table:
-    """Rows down, time across in tenths of a second; and how much less is off than residual-sup's."""
-    first = next(iter(drawn.values()))
+def time_table(rows: Mapping[str, Row]) -> Table:
+    """Return a table of errors by row and tenth of a second, with the difference to residual-sup."""
+    first = next(iter(rows.values()))
     times = [time for time in first.runs[0]["times"] if time > SECONDS and abs(10 * time - round(10 * time)) < 1e-3]
-    lines = [[name, *(row.said(at(time)) for time in times)] for name, row in drawn.items()]
-    if {OURS, SUP} <= drawn.keys():
-        less = [drawn[OURS].estimate(at(time), drawn[SUP]) for time in times]
-        lines.append([f"{OURS} minus {SUP}, 95 %", *(interval(each, alone=True) for each in less)])
+    lines = [[name, *(row.format_score(at(time)) for time in times)] for name, row in rows.items()]
+    if {OURS, SUP} <= rows.keys():
+        less = [rows[OURS].estimate(at(time), rows[SUP]) for time in times]
+        lines.append([f"{OURS} minus {SUP}, 95 %", *(interval(each, allow_one_seed=True) for each in less)])
     lines.append(["segments", *(str(int(np.isfinite(first.values(at(time))[0]).sum())) for time in times)])
     return Table(["mm", *(f"{time:.1f} s" for time in times)], lines)
 
 
 def of_sights(out: Path, sights: Iterable[Any], name: str = "{}") -> dict[Any, Row]:
     """Return the measured rows by observation."""
-    found = {sight: read_all(out, folder(name.format(sight))) for sight in sights}
-    return {sight: row for sight, row in found.items() if row is not None}
+    rows = {sight: read_all(out, folder(name.format(sight))) for sight in sights}
+    return {sight: row for sight, row in rows.items() if row is not None}
 
 
-def completions(found: Mapping[Sight, Row]) -> Table:
+def completions(rows: Mapping[Sight, Row]) -> Table:
     """Return a table of errors, one row for each observation."""
 
     def more(sight: Sight) -> str:
-        whole = found.get(replace(sight, frames=ALL))
-        if whole is None:
+        all_frames = rows.get(replace(sight, frames=ALL))
+        if all_frames is None:
             return "–"
-        return spread(100 * (found[sight].by_seed("chamfer") / whole.by_seed("chamfer") - 1), 1)
+        return spread(100 * (rows[sight].by_seed("chamfer") / all_frames.by_seed("chamfer") - 1), 1)
 
     columns: dict[str, Callable[[Sight], str]] = {
-        "Chamfer (mm)": lambda sight: found[sight].said("chamfer"),
-        "95 %": lambda sight: interval(found[sight].estimate("chamfer"), alone=True),
+        "Chamfer (mm)": lambda sight: rows[sight].format_score("chamfer"),
+        "95 %": lambda sight: interval(rows[sight].estimate("chamfer"), allow_one_seed=True),
         "more than all frames (%)": more,
-        "floor (mm)": lambda sight: found[sight].said("floor"),
-        "to points seen (mm)": lambda sight: found[sight].said("seen"),
-        "vertices (mm)": lambda sight: found[sight].said("vertices"),
-        "duration (ms)": lambda sight: found[sight].said("duration"),
-        "left (nats)": lambda sight: f"{np.median(found[sight].values('left')):.2g}",
+        "floor (mm)": lambda sight: rows[sight].format_score("floor"),
+        "to points seen (mm)": lambda sight: rows[sight].format_score("seen"),
+        "vertices (mm)": lambda sight: rows[sight].format_score("vertices"),
+        "duration (ms)": lambda sight: rows[sight].format_score("duration"),
+        "left (nats)": lambda sight: f"{np.median(rows[sight].values('left')):.2g}",
     }
-    return tabled({str(sight): sight for sight in found}, columns, "seen")
+    return tabled({str(sight): sight for sight in rows}, columns, "seen")
 
 
-def sureness(found: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> Table:
+def coverage_table(rows: Mapping[Any, Row], levels: Sequence[float] = LEVELS) -> Table:
     """Return a table of interval coverage and convergence, one row for each observation or setting."""
 
     def share(row: Row, name: str, off: Callable[[np.ndarray], np.ndarray]) -> str:
         return f"{100 * off(row.values(name)).mean():.0f}"
 
-    held = [holds(what, level) for what in ("surface", "seen", "duration") for level in levels]
+    names = [coverage_name(quantity, level) for quantity in ("surface", "seen", "duration") for level in levels]
     columns: dict[str, Callable[[Row], str]] = {
-        "vertices (mm)": lambda row: row.said("vertices"),
-        "off (mm)": lambda row: row.said("error"),
-        "sure to (mm)": lambda row: row.said("spread"),
-        **{name: partial(Row.said, score=name, digits=0) for name in held},
+        "vertices (mm)": lambda row: row.format_score("vertices"),
+        "off (mm)": lambda row: row.format_score("error"),
+        "sure to (mm)": lambda row: row.format_score("spread"),
+        **{name: partial(Row.format_score, score=name, digits=0) for name in names},
         "k-hat above 0.7 (%)": lambda row: share(row, "khat", lambda khat: khat > 0.7),
-        "converged (%)": lambda row: share(row, "left", lambda left: np.abs(left) < CONVERGED),
+        "converged (%)": lambda row: share(row, "left", lambda gain: np.abs(gain) < CONVERGED),
         "starts agree (%)": lambda row: share(row, "behind", lambda behind: np.abs(behind) < CONVERGED),
         "bent": lambda row: f"{row.values('bent').mean():.1f}",
         "seconds": lambda row: f"{np.mean([run['seconds'] for run in row.runs]):.0f}",
     }
-    return tabled({str(name): row for name, row in found.items()}, columns)
+    return tabled({str(name): row for name, row in rows.items()}, columns)
 
 
 def tables(out: Path) -> dict[str, Table]:
     """Return all available tables."""
-    found = {}
-    if drawn := curves(out):
-        found["prediction"] = by_time(drawn)
+    available = {}
+    if error_curves := error_rows(out):
+        available["prediction"] = time_table(error_curves)
     for across, sights in SIGHTS.items():
-        if there := of_sights(out, sights):
-            found[f"completion-{across}"] = completions(there)
-    if sure := of_sights(out, SURE, "sure of {}"):
-        found["completion-uncertainty"] = sureness(sure)
-    if chosen := of_sights(out, tried()):
-        found["completion-tuning"] = sureness(chosen, levels=LEVELS[1:2])
-    return {f"motion_latent_4d/{name}": table for name, table in found.items()}
+        if completed := of_sights(out, sights):
+            available[f"completion-{across}"] = completions(completed)
+    if sure := of_sights(out, UNCERTAINTY_CASES, "sure of {}"):
+        available["completion-uncertainty"] = coverage_table(sure)
+    if tuning := of_sights(out, tuning_settings()):
+        available["completion-tuning"] = coverage_table(tuning, levels=LEVELS[1:2])
+    return {f"motion_latent_4d/{name}": table for name, table in available.items()}
 
 
 @styled
 def draw(out: Path, file: Path) -> None:
-    """Errors by time; and boxes over segments by points and by frames, as the paper's figures 6 and 7."""
-    drawn, crossed = curves(out), of_sights(out, [sight for sights in SIGHTS.values() for sight in sights])
-    if not drawn and not crossed:
+    """Draw errors over time and box plots over segments by points and by frames (figures 6 and 7 of the paper)."""
+    error_curves, completed = error_rows(out), of_sights(out, [sight for sights in SIGHTS.values() for sight in sights])
+    if not error_curves and not completed:
         return
     figure = new_figure(7, 2.6)
     first, *panels = figure.subplots(1, 3)
-    highest = 0.0  # of all but the last frame held, which leaves the picture
-    for name, row in drawn.items():
-        known = {time: row.estimate(at(time)) for time in row.runs[0]["times"]}
-        points = {time: each for time, each in known.items() if each is not None}
+    highest = 0.0  # without the repeated last frame, whose errors exceed the picture
+    for name, row in error_curves.items():
+        estimates = {time: row.estimate(at(time)) for time in row.runs[0]["times"]}
+        points = {time: each for time, each in estimates.items() if each is not None}
         means = [each.mean for each in points.values()]
         highest = max(highest, *means) if name != STILL else highest
         (line,) = first.plot([*points], means, label=name)
@@ -530,11 +539,17 @@ def draw(out: Path, file: Path) -> None:
 
     def boxes(panel: Any, across: Sequence[int], label: str, ways: Mapping[str, Sequence[Sight]]) -> None:
         for place, (way, sights) in enumerate(ways.items()):
-            found = {n: np.concatenate(crossed[s].values("chamfer")) for n, s in enumerate(sights) if s in crossed}
-            if found:
-                where = {"positions": [n + 0.25 * (place - 1) for n in found], "widths": 0.2, "manage_ticks": False}
-                made = panel.boxplot(list(found.values()), flierprops={"markersize": 2}, **where)
-                for line in itertools.chain(*made.values()):
+            distances = {
+                n: np.concatenate(completed[s].values("chamfer")) for n, s in enumerate(sights) if s in completed
+            }
+            if distances:
+                layout = {
+                    "positions": [n + 0.25 * (place - 1) for n in distances],
+                    "widths": 0.2,
+                    "manage_ticks": False,
+                }
+                plotted = panel.boxplot(list(distances.values()), flierprops={"markersize": 2}, **layout)
+                for line in itertools.chain(*plotted.values()):
                     line.set_color(f"C{place}")
                 panel.plot([], [], color=f"C{place}", label=way)
         panel.set_xticks(range(len(across)), [str(value) for value in across])
@@ -543,26 +558,26 @@ def draw(out: Path, file: Path) -> None:
     ways = {"points": False, "points and markers": True}
     points = {way: [Sight(many, ALL, markers) for many in POINTS] for way, markers in ways.items()}
     frames = {way: [Sight(FEW, many, markers) for many in FRAMES] for way, markers in ways.items()}
-    alone = [Sight(0, many, True) for many in FRAMES]
+    markers_only = [Sight(0, many, True) for many in FRAMES]
     boxes(panels[0], POINTS, f"points a frame, {ALL} frames", {**points, "markers alone": [Sight(0, ALL, True)]})
-    boxes(panels[1], FRAMES, f"frames, {FEW} points in each", {**frames, "markers alone": alone})
+    boxes(panels[1], FRAMES, f"frames, {FEW} points in each", {**frames, "markers alone": markers_only})
     if panels[1].get_legend_handles_labels()[1]:
         panels[1].legend()
     figure.savefig(file, dpi=200)
 
 
-def tried() -> dict[str, tuple[Any, Deviations, dvae.Descent, bool]]:
+def tuning_settings() -> dict[str, tuple[Any, Deviations, dvae.Descent, bool]]:
     """Return the tuning settings by name: observation, deviations, descent, and whether the prior uses segments."""
-    found: dict[str, tuple[Any, Deviations, dvae.Descent, bool]] = {}
-    for sight in SURE:
+    settings: dict[str, tuple[Any, Deviations, dvae.Descent, bool]] = {}
+    for sight in UNCERTAINTY_CASES:
         kind = KINDS[str(sight)]
-        for value, (prior, aggregate) in itertools.product(TRIED[kind], PRIORS.items()):
-            how = replace(DEVIATIONS, **{kind: value}), DESCENT, aggregate
-            found[f"{sight}, {prior} prior, {kind} {value:g}"] = sight, *how
+        for value, (prior, aggregate) in itertools.product(TUNED_DEVIATIONS[kind], PRIORS.items()):
+            options = replace(DEVIATIONS, **{kind: value}), DESCENT, aggregate
+            settings[f"{sight}, {prior} prior, {kind} {value:g}"] = sight, *options
         for descent in DESCENTS:
-            told = f"{descent.steps} steps, rate {descent.rate:g}, {descent.starts} starts"
-            found[f"{sight}, {told}"] = sight, DEVIATIONS, descent, True
-    return found
+            label = f"{descent.steps} steps, rate {descent.rate:g}, {descent.starts} starts"
+            settings[f"{sight}, {label}"] = sight, DEVIATIONS, descent, True
+    return settings
 
 
 def main(
@@ -590,19 +605,22 @@ def main(
     torch.set_num_threads(1)
     refuse_unknown("part", parts, PARTS)
     for seed, path in enumerate(runs):
-        here, sup, all_of_it = out / path.name, out / f"{SUP}-{seed}", Held(path, data, budget)
+        here, sup, predicted = out / path.name, out / f"{SUP}-{seed}", EvaluatedRun(path, data, budget)
         if "prediction" in parts:
-            kept(here / "prediction.json", partial(prediction, all_of_it))
-            kept(sup / "references.json", partial(beside, all_of_it, seed, sup))
-        some = replace(all_of_it, some=True)
+            read_or_measure(here / "prediction.json", partial(measure_prediction, predicted))
+            read_or_measure(sup / "references.json", partial(measure_references, predicted, seed, sup))
+        completed = replace(predicted, some=True)
         for sight in dict.fromkeys(itertools.chain(*SIGHTS.values())) if "completion" in parts else ():
-            kept(here / f"{folder(sight)}.json", partial(completed, some, sight))
-        for sight in SURE if "uncertainty" in parts else ():
-            kept(here / f"{folder(f'sure of {sight}')}.json", partial(certain, some, sight, DEVIATIONS, DESCENT))
+            read_or_measure(here / f"{folder(sight)}.json", partial(measure_completion, completed, sight))
+        for sight in UNCERTAINTY_CASES if "uncertainty" in parts else ():
+            read_or_measure(
+                here / f"{folder(f'sure of {sight}')}.json",
+                partial(measure_coverage, completed, sight, DEVIATIONS, DESCENT),
+            )
     if tuned is not None and "tuning" in parts:
-        held = Held(tuned, data, budget, some=True, grouped=True)
-        for name, choice in tried().items():
-            kept(out / TUNING / f"{folder(name)}.json", partial(certain, held, *choice))
+        run = EvaluatedRun(tuned, data, budget, some=True, grouped=True)
+        for name, choice in tuning_settings().items():
+            read_or_measure(out / TUNING / f"{folder(name)}.json", partial(measure_coverage, run, *choice))
     write(results, tables(out))
     draw(out, picture)
 

@@ -10,7 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
-if __name__ == "__main__":  # amid an import, a KeyboardInterrupt can come out as any error
+if __name__ == "__main__":  # during an import, a KeyboardInterrupt can become any error
     signal.signal(signal.SIGINT, lambda *_: os.write(2, b"interrupted\n") and os._exit(130))
 
 import torch
@@ -52,11 +52,11 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
     runs = {name: out / "runs" / name for name in RATES}
     for name, run in runs.items():
         steps = max(round(share * STEPS[name]), 1)
-        loss = {"loss": "evidence"} if name == "hit-dvae" else {}  # its paper's takes longer
+        loss = {"loss": "evidence"} if name == "hit-dvae" else {}  # the loss of its paper takes longer
         method = dvae.method(name, latent=8, scheduled_sampling=1.0, warm_up=steps // 3, **loss)
         print(f"\n[bold]{name}[/bold]  {method.generative}   {method.inference}", method.source)
         training = dvae.Training(steps=steps, batch_size=32, learning_rate=RATES[name], decay=0.5)
-        result = fitted(method, data, run, training)
+        result = fit_or_resume(method, data, run, training)
         print(result.best)
 
     models = {name: dvae.load(run).model for name, run in runs.items()}
@@ -87,7 +87,7 @@ def main(out: Path = Path("demo"), share: float = 1.0, samples: int = 20, clips:
         raise SystemExit("the report failed")
 
 
-def fitted(method: Trainable, data: Dataset, run: Path, training: dvae.Training) -> Fit:
+def fit_or_resume(method: Trainable, data: Dataset, run: Path, training: dvae.Training) -> Fit:
     """Fit a method, or continue a run that was interrupted."""
     if Run(run).exists:
         before = read_config(run)

@@ -56,17 +56,17 @@ def folder(name: Any) -> str:
     return str(name).replace(", ", "-").replace(",", "").replace(" ", "-")
 
 
-def kept(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+def read_or_measure(file: Path, measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
     """Read a measurement from a file. If the file is missing, measure, and write the result with its processor time."""
     if not file.exists():
-        begun = time.process_time()
-        found = measure()
-        spent = time.process_time() - begun
+        start = time.process_time()
+        measurement = measure()
+        elapsed = time.process_time() - start
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(plain({"seconds": spent, **found})))
-        print(f"{file}: {spent:.0f} s of processor time", flush=True)
-    read: dict[str, Any] = json.loads(file.read_text())
-    return read
+        file.write_text(json.dumps(plain({"seconds": elapsed, **measurement})))
+        print(f"{file}: {elapsed:.0f} s of processor time", flush=True)
+    stored: dict[str, Any] = json.loads(file.read_text())
+    return stored
 
 
 def measure(
@@ -75,10 +75,10 @@ def measure(
     """Fit and measure all missing cases, seed by seed, by calling `run(case, seed, directory)`."""
     for seed, case in itertools.product(seeds, cases):
         out = path / f"{folder(case)}-{seed}"
-        kept(out / file, partial(run, case, seed, out))
+        read_or_measure(out / file, partial(run, case, seed, out))
 
 
-def fitted(
+def fit_or_load(
     method: Any, data: Any, train: Any, validation: Any = None, *, out: Path, seed: int, steps: int, **options: Any
 ) -> Fit:
     """Fit a method, resume its run, or load the finished run.
@@ -96,11 +96,11 @@ def fitted(
     torch.manual_seed(seed)
     model, recipe = method.build(data.schema), method.train(train, validation, steps)
     config = Config(method, data.schema, data.kind, data.recorded(), dvae.Training()).written()
-    told = {"resume": Run(out).exists, "config": config, "seed": seed, "steps": steps, "progress": False}
-    return dvae.fit(model, recipe, out=out, **told, **options)
+    run_options = {"resume": Run(out).exists, "config": config, "seed": seed, "steps": steps, "progress": False}
+    return dvae.fit(model, recipe, out=out, **run_options, **options)
 
 
-def swept(
+def sweep_seeds(
     row: str, method: Any, data: Any, runs: Path, seeds: Sequence[int], training: Any, jobs: int = 1
 ) -> list[Path]:
     """Return the run directories of a method, one per seed; missing runs are fitted.
@@ -154,31 +154,31 @@ class Row:
         """Return weighted means (S,) of a score."""
         return np.average(self.values(score), 1, self.parts[0]["weights"])
 
-    def crossed(self, score: str, minus: Row | None = None) -> TwoWayErrors | None:
+    def two_way_errors(self, score: str, minus: Row | None = None) -> TwoWayErrors | None:
         """Return a score by seed and clip, or its paired difference to another row; None if a score is missing."""
         values, others = self.values(score), 0.0 if minus is None else minus.values(score)
         if values is None or others is None:
             return None
         values, first = values - others, self.parts[0]
-        there = ~np.isnan(values).any(0)
-        if not there.any():
+        valid = ~np.isnan(values).any(0)
+        if not valid.any():
             return None
-        values, clips, weights = values[:, there], np.array(first["clips"])[there], np.array(first["weights"])[there]
+        values, clips, weights = values[:, valid], np.array(first["clips"])[valid], np.array(first["weights"])[valid]
         order = {clip: place for place, clip in enumerate(dict.fromkeys(clips))}
-        if len(order) == len(clips):  # no sum that is divided again, so that equal seeds have no error
-            found = TwoWayErrors.of(values, weights)
+        if len(order) == len(clips):  # no sums by clip, so that equal seeds have exactly no error
+            errors = TwoWayErrors.of(values, weights)
         else:
-            found = TwoWayErrors.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))
-        return found if self.trained else replace(found, seeds=0.0, rest=0.0, count=sys.maxsize)
+            errors = TwoWayErrors.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))
+        return errors if self.trained else replace(errors, seeds=0.0, rest=0.0, count=sys.maxsize)
 
     def estimate(self, score: str, other: Row | None = None) -> Estimate | None:
         """Return the mean, or its paired difference to a row of other runs; None if a score is missing."""
-        own, theirs = self.crossed(score), None if other is None else other.crossed(score)
-        return None if own is None or (other is not None and theirs is None) else own.estimate(theirs)
+        errors, other_errors = self.two_way_errors(score), None if other is None else other.two_way_errors(score)
+        return None if errors is None or (other is not None and other_errors is None) else errors.estimate(other_errors)
 
-    def said(self, score: str, digits: int = 1) -> str:
+    def format_score(self, score: str, digits: int = 1) -> str:
         """Format the mean with its errors over clips and over seeds."""
-        return said(self.estimate(score), digits)
+        return format_mean(self.estimate(score), digits)
 
     def numbers(self, name: str) -> str:
         """Format one number per run by `spread`."""
@@ -196,21 +196,21 @@ class Archive:
         """Sorted names of the measurements; empty if the file does not exist."""
         if not self.file.exists():
             return []
-        with zipfile.ZipFile(self.file) as opened:
-            return sorted(opened.namelist())
+        with zipfile.ZipFile(self.file) as archive:
+            return sorted(archive.namelist())
 
     def read(self, names: Iterable[str]) -> list[dict[str, Any]]:
         """Return measurements; the file stores the number of windows of each clip."""
-        with zipfile.ZipFile(self.file) as opened:
-            found = [json.loads(opened.read(name)) for name in names]
-        return [each | {"clips": [*each["clips"]], "weights": [*each["clips"].values()]} for each in found]
+        with zipfile.ZipFile(self.file) as archive:
+            measurements = [json.loads(archive.read(name)) for name in names]
+        return [each | {"clips": [*each["clips"]], "weights": [*each["clips"].values()]} for each in measurements]
 
     def add(self, name: str, measurement: Mapping[str, Any]) -> None:
         """Add a measurement, whose `clips` map each clip to its number of windows."""
         contents = {name: json.dumps(measurement, separators=(",", ":")).encode()}
         if self.file.exists():
-            with zipfile.ZipFile(self.file) as opened:
-                contents = {name: opened.read(name) for name in opened.namelist()} | contents
+            with zipfile.ZipFile(self.file) as archive:
+                contents = {name: archive.read(name) for name in archive.namelist()} | contents
         with (
             files.atomic_write(self.file) as new,
             zipfile.ZipFile(new, "w", zipfile.ZIP_LZMA) as out,
@@ -222,13 +222,13 @@ class Archive:
 def read(path: Path, cases: Iterable[str], file: str = MEASURED) -> dict[str, Row]:
     """Return the measured cases, each with all its seeds."""
     files = {case: sorted(path.glob(f"{folder(case)}-[0-9]*/{file}")) for case in cases}
-    return {case: Row([json.loads(each.read_text()) for each in found]) for case, found in files.items() if found}
+    return {case: Row([json.loads(each.read_text()) for each in paths]) for case, paths in files.items() if paths}
 
 
 def read_all(path: Path, name: str) -> Row | None:
     """Return the measurements of all runs under one name, or None without any."""
-    found = [json.loads(file.read_text()) for file in sorted(path.glob(f"*/{name}.json"))]
-    return Row(found) if found else None
+    measurements = [json.loads(file.read_text()) for file in sorted(path.glob(f"*/{name}.json"))]
+    return Row(measurements) if measurements else None
 
 
 def budget(rows: Iterable[Row], steps: int) -> str:
@@ -237,23 +237,23 @@ def budget(rows: Iterable[Row], steps: int) -> str:
     return f"{steps} steps of training, {min(seconds):.0f} to {max(seconds):.0f} s of processor time."
 
 
-def said(found: Estimate | None, digits: int = 1) -> str:
+def format_mean(estimate: Estimate | None, digits: int = 1) -> str:
     """Format a mean and its errors over clips and over seeds; a dash marks unknown numbers."""
-    values = () if found is None else (found.mean, found.sequences, found.seeds)
+    values = () if estimate is None else (estimate.mean, estimate.sequences, estimate.seeds)
     return " ± ".join("–" if np.isnan(value) else f"{value:.{digits}f}" for value in values) or "–"
 
 
-def cell(found: Estimate | None) -> str:
+def cell(estimate: Estimate | None) -> str:
     """Format an estimate with digits chosen by its errors; rows without training have no error over seeds."""
-    text = "–" if found is None else str(found)
-    return text.rpartition(" ± ")[0] if found is not None and not found.seeds else text
+    text = "–" if estimate is None else str(estimate)
+    return text.rpartition(" ± ")[0] if estimate is not None and not estimate.seeds else text
 
 
-def interval(found: Estimate | None, digits: int = 1, *, alone: bool = False) -> str:
-    """Format the 95 % interval from both errors; with `serialized` and one seed, from the error over clips."""
-    if found is None or (np.isnan(found.total) and not alone):
+def interval(estimate: Estimate | None, digits: int = 1, *, allow_one_seed: bool = False) -> str:
+    """Format the 95 % interval from both errors; one seed has an interval only with `allow_one_seed`, over clips."""
+    if estimate is None or (np.isnan(estimate.total) and not allow_one_seed):
         return "–"
-    low, high = found.interval(error="sequences" if np.isnan(found.total) else "total")
+    low, high = estimate.interval(error="sequences" if np.isnan(estimate.total) else "total")
     return "–" if np.isnan(low) else f"{low:.{digits}f} to {high:.{digits}f}"
 
 

@@ -8,7 +8,7 @@ import tyro
 
 import dvae
 
-from .engine import said
+from .engine import format_mean
 from .results import Table, ordered, tabled, write
 
 DIGITS = {"ADE": 3, "FDE": 3, "MMADE": 3, "MMFDE": 3, "APD": 2, "energy score": 2}
@@ -26,14 +26,18 @@ def tables(comparison: dvae.Comparison) -> dict[str, Table]:
         )
 
     forced: dict[str, Callable[[str], str]] = {
-        f"IWAE bound, K = {comparison.particles}": lambda name: said(comparison[name]["IWAE bound"], 2),
-        "difference to the best": lambda name: said(None if name == best else comparison.difference(name, best), 2),
+        f"IWAE bound, K = {comparison.particles}": lambda name: format_mean(comparison[name]["IWAE bound"], 2),
+        "difference to the best": lambda name: format_mean(
+            None if name == best else comparison.difference(name, best), 2
+        ),
         "ELBO": lambda name: f"{comparison[name]['ELBO'].mean:.2f}",
         "k-hat > 0.7": lambda name: f"{100 * comparison.rows[name].unreliable:.0f} %",
         "KL in nats a frame, active units": latents,
     }
     free = {
-        score + ARROWS.get(score, ""): lambda name, score=score, digits=digits: said(comparison[name][score], digits)
+        score + ARROWS.get(score, ""): lambda name, score=score, digits=digits: format_mean(
+            comparison[name][score], digits
+        )
         for score, digits in DIGITS.items()
     }
     order = ordered({name: name for name in ranking}, lambda name: comparison[name]["energy score"].mean)
@@ -49,7 +53,7 @@ def main(files: tyro.conf.Positional[tuple[Path, ...]], results: Path | None = N
     """Write the tables.
 
     Args:
-        files: what `dvae compare --out` wrote.
+        files: files written by `dvae compare --out`.
         results: folder of the tables, such as benchmarks/results; None prints them.
     """
     write(results, tables(reduce(dvae.Comparison.join, map(dvae.Comparison.load, files))))

@@ -11,7 +11,7 @@ from .results import Table, loaded, tabled, write
 
 @torch.no_grad()
 def long_run(path: Path, count: int, seconds: float) -> Table:
-    """Bones and speed of forecasts that run on far past the horizon of training, second by second."""
+    """Return a table of bone lengths and speed, by second, of forecasts beyond the training horizon."""
     run = loaded(path)
     test = run.data.windows("test")
     x = test.all()["x"]
@@ -22,13 +22,13 @@ def long_run(path: Path, count: int, seconds: float) -> Table:
     futures = torch.cat(
         [run.model.forecast(part[:, :observed], frames, 5, draw_emission=False)["x"] for part in x.split(40)], 1
     )
-    ours, real = test.positions(futures), test.positions(x)
-    lengths, true = test.skeleton.bone_lengths(ours), test.skeleton.bone_lengths(real).mean(1)
+    generated, real = test.positions(futures), test.positions(x)
+    lengths, true = test.skeleton.bone_lengths(generated), test.skeleton.bone_lengths(real).mean(1)
     error = (lengths / true[:, None] - 1).abs()  # (S, B, T, bones)
     moving = real.diff(dim=1).norm(dim=-1).mean() * fps
     spans = {str(second): slice((second - 1) * fps, second * fps) for second in range(1, frames // fps + 1)}
     bones = {second: error[:, :, now].mean((0, 1, 2)) for second, now in spans.items()}
-    speeds = {second: ours[:, :, now].diff(dim=2).norm(dim=-1).mean() * fps for second, now in spans.items()}
+    speeds = {second: generated[:, :, now].diff(dim=2).norm(dim=-1).mean() * fps for second, now in spans.items()}
 
     def worst(second: str) -> str:
         name = test.skeleton.names[test.skeleton.edges[int(bones[second].argmax())][1]]

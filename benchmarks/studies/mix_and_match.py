@@ -31,24 +31,24 @@ from dvae.models.motion.codes import CodeDiversity, code_diversity
 from dvae.motion.geometry.euler import COUNTS, TIMES, euler_errors
 from dvae.motion.metric_models.quality import STILL, RealOrGenerated, quality
 
-from .engine import OURS, Row, budget, fitted, folder, measure, read, scores_of, settings, spread
+from .engine import OURS, Row, budget, fit_or_load, folder, measure, read, scores_of, settings, spread
 from .results import DOCS, Table, tabled, write
 
 OPTIONS: dict[str, Any] = {"width": 128, "scale": 0.01}
-"""Of all runs, chosen on the tuning protocol; others are those of the method."""
+"""Options of all runs, selected with the tuning protocol; others have their defaults."""
 TRAINING: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5}
 STEPS, SAMPLES, EVERY, THINNED = 1000, 50, 10, 4
-"""Of training; futures; of test windows each so many-th is scored, and of these for errors of angles."""
+"""Training steps, futures, stride over test windows, and further stride for errors of angles."""
 FUTURES = 500
-"""Of "mix, velocity", the most of whose errors of angles the best is taken; of others it is SAMPLES."""
+"""Largest number of futures for the best error of angles of "mix, velocity"; SAMPLES for others."""
 WATCHED = 50
-"""Observations whose codes are."""
-JUDGED: dict[str, Any] = {"width": 64}
+"""Number of observations for the diversity of codes."""
+METRIC_MODEL_OPTIONS: dict[str, Any] = {"width": 64}
 METRIC_MODEL: dict[str, Any] = {"optimizer": "adam", "learning_rate": 2e-3, "momentum": 0.0, "batch_size": 128}
 METRIC_MODEL |= {"examples": 4000, "steps": 400}
 PROBE, NOTHING = {"z": Normal(50.0, 50**0.5)}, {"z": Normal(0.0, 1e-6)}
 SCORES = ("APD", "ADE", "FDE", "jerk")
-PROBED, UNSAID = "probed", "unsaid"
+PROBED, INDICES_ONLY = "probed", "unsaid"
 BODY = (
     *("hip", "abdomen", "chest", "neck", "head"),
     *(side + joint for side in "lr" for joint in ("Collar", "Shldr", "ForeArm", "Hand")),
@@ -73,7 +73,7 @@ class Section:
 
     @property
     def steps(self) -> int:
-        """Of a run."""
+        """Training steps of a run."""
         return round(self.share * STEPS)
 
 
@@ -86,10 +86,10 @@ NAMED, TUNING, RAW = CASES["ways"], "bandai2-tuning", "cmu-bvh"
 
 
 def recorded(path: Path) -> motion.MotionSet:
-    """Turns as files have them: clips of BVH at 30 frames a second, of each the last third for test.
+    """Read the rotations of BVH clips at 30 frames a second; the last third of each clip is for test.
 
-    The rest pose that they start in, and the frames that settle out of it, are left out. Headers give all clips 120
-    frames a second, which is twice too many for salsa_10 (see the notes of the data).
+    Clips start after the rest pose and the frames next to it. Headers state 120 frames a second for all clips, which is
+    twice the true rate of salsa_10 (see the notes of the data).
     """
     people = [
         motion.read_motion(file, joints=BODY, fps=60 if file.stem == "salsa_10" else None).resampled(30)
@@ -102,7 +102,7 @@ def recorded(path: Path) -> motion.MotionSet:
 
 
 def data_of(protocol: str, file: Path) -> motion.MotionData:
-    """Motion as quaternions under a protocol."""
+    """Read motion as quaternions under a protocol."""
     if protocol == RAW:
         people, cut = recorded(file), replace(motion.PROTOCOLS["cmu8"], name=RAW, train_stride=1, test_stride=2)
     else:
@@ -111,9 +111,9 @@ def data_of(protocol: str, file: Path) -> motion.MotionData:
     return motion.MotionData(str(file), people, replace(cut, representation="quaternion"))
 
 
-def some_scores(held: Any) -> list[Measure]:
+def some_scores(windows: Any) -> list[Measure]:
     """Return the motion scores that the tables show."""
-    return [measure for measure in motion.scores(held) if measure.name in SCORES]
+    return [measure for measure in motion.scores(windows) if measure.name in SCORES]
 
 
 def measured(section: Section, data: motion.MotionData, case: str, seed: int, out: Path) -> dict[str, Any]:
@@ -125,69 +125,81 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
     past = test.all().past(test.protocol.observed).rows(some)
     watch = CodeDiversity(past, every=max(steps // 15, 1))
     training = {**TRAINING, "steps": steps, "validate_every": max(steps // 3, 1), "callbacks": [watch]}
-    fit = fitted(method, data, train, out=out, seed=seed, **training)
+    fit = fit_or_load(method, data, train, out=out, seed=seed, **training)
     model, (watched, diversity) = fit.model.eval(), fit.series("codes/diversity")
     late = [row["kl/z"] for row in fit.history if "kl/z" in row and row["step"] > 0.9 * steps]
 
     noise, full = bool(method.alpha), case in NAMED
-    how = {"seed": seed, "progress": False}
-    forecasts = {**how, "scores": some_scores, "batch_size": 64}
+    options = {"seed": seed, "progress": False}
+    forecasts = {**options, "scores": some_scores, "batch_size": 64}
     samples = SAMPLES if noise else 1
     models = {OURS: model, **({PROBED: RedrawnModel(model, PROBE)} if noise and full else {})}
-    scored = dvae.evaluate(models, test, samples=samples, **forecasts)
-    told = {"method": RealOrGenerated(**JUDGED), "seeds": (seed,), "references": case == "mix", **how, **METRIC_MODEL}
-    judged = quality({OURS: model}, train, test, **told)
-    futures = {
-        name: {score: row[score][0] for score in row} | {score: scored.rows[name].clip_means[score] for score in SCORES}
-        for name, row in judged.rows.items()
+    evaluation = dvae.evaluate(models, test, samples=samples, **forecasts)
+    quality_options = {
+        "method": RealOrGenerated(**METRIC_MODEL_OPTIONS),
+        "seeds": (seed,),
+        "references": case == "mix",
+        **options,
+        **METRIC_MODEL,
     }
-    found: dict[str, Any] = {
+    qualities = quality({OURS: model}, train, test, **quality_options)
+    futures = {
+        name: {score: row[score][0] for score in row}
+        | {score: evaluation.rows[name].clip_means[score] for score in SCORES}
+        for name, row in qualities.rows.items()
+    }
+    measurement: dict[str, Any] = {
         "seconds": fit.processor_seconds,
         "steps": watched,
         "codes": {"diversity": diversity, "deviation": fit.series("codes/deviation")[1]},
         "KL": float(np.mean(late)) if late else None,
-        "futures": scores_of(scored.clips, futures),
-        "jerk": next(note for note in scored.notes if note.startswith("jerk")),
-        PROBED: scored.ratio(PROBED, OURS, "APD").mean if PROBED in models else None,
+        "futures": scores_of(evaluation.clips, futures),
+        "jerk": next(note for note in evaluation.notes if note.startswith("jerk")),
+        PROBED: evaluation.ratio(PROBED, OURS, "APD").mean if PROBED in models else None,
     }
     if full:
         counts = [count for count in COUNTS if count <= (FUTURES if case == "mix, velocity" else samples)]
-        angles = euler_errors({OURS: model}, fewer, counts=counts, **how)
-        found["angles"] = scores_of(angles.clips, {name: plain(angles.rows[name].clip_means) for name in futures})
+        angles = euler_errors({OURS: model}, fewer, counts=counts, **options)
+        measurement["angles"] = scores_of(angles.clips, {name: plain(angles.rows[name].clip_means) for name in futures})
     if method.noise == "mix" and noise:
-        # ratios of diversity: codes with indices drawn once over codes with all drawn; futures with z at
-        # 0, which differ in their indices only, over futures with all drawn
+        # Ratios of diversity. Codes: indices drawn once over all drawn. Futures: z at 0, so that only indices differ,
+        # over all drawn.
         with seeded_evaluation(model, seed):
-            drawn, once = (code_diversity(model, batch).mean() for batch in (past, model.read(past)))
-        unsaid = dvae.evaluate({OURS: model, UNSAID: RedrawnModel(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts)
-        found |= {"latent": float(once / drawn), "indices": unsaid.ratio(UNSAID, OURS, "APD").mean}
-    return found
+            all_drawn, once = (code_diversity(model, batch).mean() for batch in (past, model.read(past)))
+        indices_only = dvae.evaluate(
+            {OURS: model, INDICES_ONLY: RedrawnModel(model, NOTHING)}, fewer, samples=SAMPLES, **forecasts
+        )
+        measurement |= {
+            "latent": float(once / all_drawn),
+            "indices": indices_only.ratio(INDICES_ONLY, OURS, "APD").mean,
+        }
+    return measurement
 
 
 # Tables
 
 
 def percentages(row: Row) -> str:
-    """The interval of quality, within what percentages can be."""
+    """Format the interval of the quality, clipped to 0 and 100 %."""
     low, high = np.clip(row.estimate("quality").interval(), 0, 100)
     return "–" if np.isnan(low) else f"{low:.1f} to {high:.1f}"
 
 
-def codes(of: Callable[[Any], float]) -> Callable[[Row], str]:
-    """One number of how diverse codes were over training."""
-    return lambda row: spread([of(run["codes"]["diversity"]) for run in row.runs])
+def codes(statistic: Callable[[Any], float]) -> Callable[[Row], str]:
+    """Return a column with a statistic of the diversity of codes over training."""
+    return lambda row: spread([statistic(run["codes"]["diversity"]) for run in row.runs])
 
 
 SCORED: dict[str, Callable[[Row], str]] = {
-    "quality (%)": lambda row: row.said("quality"),
+    "quality (%)": lambda row: row.format_score("quality"),
     "95 %": percentages,
-    "taken for real (%)": lambda row: row.said("taken for real"),
-    "APD (m)": lambda row: row.said("APD", 3),
-    "ADE (m)": lambda row: row.said("ADE", 3),
-    "FDE (m)": lambda row: row.said("FDE", 3),
-    "jerk (m/s³)": lambda row: row.said("jerk"),
+    "taken for real (%)": lambda row: row.format_score("taken for real"),
+    "APD (m)": lambda row: row.format_score("APD", 3),
+    "ADE (m)": lambda row: row.format_score("ADE", 3),
+    "FDE (m)": lambda row: row.format_score("FDE", 3),
+    "jerk (m/s³)": lambda row: row.format_score("jerk"),
 }
-LISTENING: dict[str, Callable[[Row], str]] = {
+NOISE_COLUMNS: dict[str, Callable[[Row], str]] = {
     "codes, first": codes(itemgetter(0)),
     "greatest": codes(max),
     "least": codes(min),
@@ -197,39 +209,42 @@ LISTENING: dict[str, Callable[[Row], str]] = {
     "APD, z probed": lambda row: row.numbers(PROBED),
     "APD, z at 0": lambda row: row.numbers("indices"),
 }
-"""What tells whether noise is heard."""
+"""Columns that show whether the decoder uses the noise."""
 
 
-def heard(found: Mapping[str, Row]) -> dict[str, Row]:
-    """Ways that have noise."""
-    return {name: row for name, row in found.items() if row.name == OURS and row.runs[0]["codes"]["diversity"][-1] > 0}
+def rows_with_noise(rows: Mapping[str, Row]) -> dict[str, Row]:
+    """Return the rows of methods with noise."""
+    return {name: row for name, row in rows.items() if row.name == OURS and row.runs[0]["codes"]["diversity"][-1] > 0}
 
 
-def angles(found: Mapping[str, Row]) -> Table:
-    """Ways and numbers of futures down, times across."""
+def angles(rows: Mapping[str, Row]) -> Table:
+    """Return a table of errors of angles by row, number of futures and time."""
     lines = []
-    for name, row in found.items():
+    for name, row in rows.items():
         for count in {"mix, velocity": COUNTS, STILL: (1,)}.get(name, (1, 50)):
-            cells = [row.of("angles").said(f"{time:g} ms, best of {count}", 2) for time in TIMES]
+            cells = [row.of("angles").format_score(f"{time:g} ms, best of {count}", 2) for time in TIMES]
             lines += [[name, str(count), *cells]] if "–" not in cells else []
     return Table(["", "best of", *(f"{time:g} ms" for time in TIMES)], lines)
 
 
-def tables(name: str, found: Mapping[str, Row]) -> dict[str, Table]:
+def tables(name: str, rows: Mapping[str, Row]) -> dict[str, Table]:
     """Return a section's tables."""
-    first = next(iter(found.values())).runs[0]
-    clips, spent = first["futures"]["weights"], budget(found.values(), SECTIONS[name].steps)
-    done = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {spent}"
-    futures = {case: row.of("futures") for case, row in found.items()}
-    made = {"futures": tabled(futures, SCORED, note=done), "noise": tabled(heard(found), LISTENING)}
-    made |= {"angles": angles(found)} if "angles" in first else {}
-    return {f"mix_and_match/{folder(name)}-{what}": table for what, table in made.items()}
+    first = next(iter(rows.values())).runs[0]
+    clips, costs = first["futures"]["weights"], budget(rows.values(), SECTIONS[name].steps)
+    note = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {costs}"
+    futures = {case: row.of("futures") for case, row in rows.items()}
+    named_tables = {
+        "futures": tabled(futures, SCORED, note=note),
+        "noise": tabled(rows_with_noise(rows), NOISE_COLUMNS),
+    }
+    named_tables |= {"angles": angles(rows)} if "angles" in first else {}
+    return {f"mix_and_match/{folder(name)}-{kind}": table for kind, table in named_tables.items()}
 
 
 @styled
-def draw(found: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None:
-    """Codes over training, one panel for each way; and quality against diversity."""
-    ways = {name: row.of("futures") for name, row in heard(found).items()}
+def draw(cases: Mapping[str, Row], sweep: Mapping[str, Row], file: Path) -> None:
+    """Draw the diversity of codes over training, one panel for each method, and quality against diversity."""
+    ways = {name: row.of("futures") for name, row in rows_with_noise(cases).items()}
     rows = math.ceil((len(ways) + 1) / 3)
     figure = new_figure(7, 2.2 * rows + 0.6)
     panels = list(figure.subplots(rows, 3, squeeze=False).flat)
@@ -294,16 +309,16 @@ def main(
         if file := raw if section.protocol == RAW else data:
             run = partial(measured, section, data_of(section.protocol, file))
             measure(runs / folder(name), cases or section.cases, seeds, run)
-    there = {name: read(runs / folder(name), section.cases) for name, section in SECTIONS.items()}
-    found = {
+    stored = {name: read(runs / folder(name), section.cases) for name, section in SECTIONS.items()}
+    rows_by_section = {
         name: ({STILL: replace(rows["mix"], name=STILL)} if "mix" in rows else {}) | rows
-        for name, rows in there.items()
+        for name, rows in stored.items()
     }
-    for name, rows in found.items():
+    for name, rows in rows_by_section.items():
         if rows:
             write(results, tables(name, rows))
-    if found[TUNING]:
-        draw(found[TUNING], found["alpha"], picture)
+    if rows_by_section[TUNING]:
+        draw(rows_by_section[TUNING], rows_by_section["alpha"], picture)
 
 
 if __name__ == "__main__":

@@ -24,26 +24,26 @@ from dvae.motion.segments.embodied import Segments
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
-from .engine import OURS, Row, budget, fitted, folder, interval, measure, read, settings
+from .engine import OURS, Row, budget, fit_or_load, folder, interval, measure, read, settings
 from .results import Table, tabled, write
 
-TUNING, HELD = "tuning", "held out"
+TUNING, HELD_OUT = "tuning", "held out"
 SAME, OTHER = "same source", "other source"
 GROUPS = {"A": "train", "B": "test"}
-"""Of bandai2: what trains and what tests where options are chosen, whatever the file's own split."""
+"""Splits of the file groups of bandai2 for tuning, which replace the split of the file."""
 TRAINING: dict[str, Any] = {"batch_size": 64, "validate_every": 250}
 PAIRS, STEPS = 200, 9
-"""Of walks and runs that are interpolated, and the steps of each, both ends included."""
+"""Number of interpolated pairs of a walk and a run, and steps of each, including both ends."""
 FALLS = ("falls", "falls where the run is shorter")
 ERROR, DURATION = "vertex error", "duration error"
 FULL, FIRST, SHAPED = "both phases", "first phase alone", "guide with beta"
 CASES = settings(__file__)
-SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD: CASES["named"]}
+SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD_OUT: CASES["named"]}
 
 
 @cache
 def segments(section: str, file: Path, **options: Any) -> SegmentData:
-    """Gait cycles of bandai2 under the file's own split by take, or to choose options by."""
+    """Read gait cycles of bandai2, split by take as in the file or, for tuning, by file group."""
     people = motion.read_motion(file)
     if section == TUNING:
         groups = ((clip, GROUPS.get(clip.labels["file_group"])) for clip in people)
@@ -51,106 +51,110 @@ def segments(section: str, file: Path, **options: Any) -> SegmentData:
     return SegmentData(str(file), people, **options)
 
 
-def elsewhere(file: Path, timed: motion.TimedFrames) -> Segments:
-    """All gait cycles of a source that nothing was learned from."""
+def other_source(file: Path, timed: motion.TimedFrames) -> Segments:
+    """Return all gait cycles of a source outside the training data."""
     return Segments(SegmentData.open(file).segments, timed)
 
 
 def measured(model: Any, tests: Mapping[str, Segments], training: Segments, seed: int) -> dict[str, Any]:
-    """Scores of a model by test set, row and segment; and how walks become runs."""
-    found: dict[str, Any] = {}
+    """Return scores of a model by test set, row and segment, and measures of its interpolations."""
+    measurement: dict[str, Any] = {}
     for name, test in tests.items():
-        scored = reconstruct_segments({OURS: model}, test, training, bound_particles=20, seed=seed, progress=False)
-        takes = [f"{split}/{take}" for split, _, take in scored.segments]
-        found[name] = {"clips": takes, "weights": [1] * len(takes), "rows": scored.rows}
-    return {"tests": [*tests], **found, "interpolation": interpolated(model, next(iter(tests.values())), seed)}
+        reconstruction = reconstruct_segments(
+            {OURS: model}, test, training, bound_particles=20, seed=seed, progress=False
+        )
+        takes = [f"{split}/{take}" for split, _, take in reconstruction.segments]
+        measurement[name] = {"clips": takes, "weights": [1] * len(takes), "rows": reconstruction.rows}
+    return {"tests": [*tests], **measurement, "interpolation": interpolated(model, next(iter(tests.values())), seed)}
 
 
 def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
-    """Pairs of a walk and a run, drawn at random, that begin with the same foot."""
+    """Interpolate between random pairs of a walk and a run that begin with the same foot, and measure the paths."""
     kinds = [(labels["content"], labels["cycle"]) for labels in test.labels]
     generator = np.random.default_rng(seed)
     ends = []
     for side in ("left", "right"):
-        own = [np.flatnonzero([kind == (content, side) for kind in kinds]) for content in ("walk", "run")]
-        ends.append(np.stack([generator.choice(those, PAIRS // 2) for those in own]))
+        segments_by_content = [
+            np.flatnonzero([kind == (content, side) for kind in kinds]) for content in ("walk", "run")
+        ]
+        ends.append(np.stack([generator.choice(those, PAIRS // 2) for those in segments_by_content]))
     first, second = (Batch(test.all()).rows(some) for some in np.concatenate(ends, 1))
-    found = interpolate(model, first, second, STEPS)
+    paths = interpolate(model, first, second, STEPS)
     lasts = [test.timed.lasts(batch["x"]) for batch in (first, second)]
-    falling, shorter = falls(found.durations), (lasts[1] < lasts[0]).to(found.durations.device)
-    kept = {"durations": found.durations, "displacements": found.displacements, "local": found.local_pose}
+    falling, shorter = falls(paths.durations), (lasts[1] < lasts[0]).to(paths.durations.device)
+    curves = {"durations": paths.durations, "displacements": paths.displacements, "local": paths.local_pose}
     return {
         **dict(zip(FALLS, (falling.double().mean().item(), falling[shorter].double().mean().item()), strict=True)),
         "shorter": shorter.double().mean().item(),
-        **{name: values.double().mean(0).tolist() for name, values in kept.items()},
+        **{name: values.double().mean(0).tolist() for name, values in curves.items()},
     }
 
 
 def run(section: str, file: Path, other: Path | None, steps: int, case: str, seed: int, out: Path) -> dict[str, Any]:
-    """Fits and measures a case."""
+    """Fit and measure a case."""
     options = SECTIONS[section][case]
     data = segments(section, file, **options.get("data", {}))
     train, method = data.windows("train"), dvae.method("motion-latent", **options.get("method", {}))
-    fit = fitted(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **TRAINING)
+    fit = fit_or_load(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **TRAINING)
     tests = {SAME: data.windows("test")}
-    if other is not None and section == HELD:
-        tests[OTHER] = elsewhere(other, data.timed)
-    found = measured(fit.model.eval(), tests, train, seed)
-    return {"seconds": fit.processor_seconds, "steps": steps, **found}
+    if other is not None and section == HELD_OUT:
+        tests[OTHER] = other_source(other, data.timed)
+    measurement = measured(fit.model.eval(), tests, train, seed)
+    return {"seconds": fit.processor_seconds, "steps": steps, **measurement}
 
 
 def rows_of(path: Path, section: str) -> dict[str, Row]:
     """Return the available cases, then the linear models of the first case of each size."""
-    found, linear = read(path, SECTIONS[section]), dict[str, Row]()
-    for row in found.values():
+    rows, linear = read(path, SECTIONS[section]), dict[str, Row]()
+    for row in rows.values():
         (name,) = row.runs[0][SAME]["rows"].keys() - {OURS}
         linear.setdefault(name, replace(row, name=name))
-    return found | linear
+    return rows | linear
 
 
 def errors(row: Row) -> np.ndarray:
-    """Vertex errors of all segments and seeds, in millimetres."""
+    """Return vertex errors of all segments and seeds, in millimetres."""
     return np.concatenate(row.values(ERROR))
 
 
 def falling(name: str, row: Row) -> str:
-    """Share of pairs whose durations fall at each step, of each seed."""
+    """Format, for each seed, the share of pairs with decreasing durations."""
     return ", ".join(f"{run['interpolation'][name]:.2f}" for run in row.runs) if row.name == OURS else "–"
 
 
 SCORED: dict[str, Callable[[Row], str]] = {
-    "vertex error (mm)": lambda row: row.said(ERROR),
+    "vertex error (mm)": lambda row: row.format_score(ERROR),
     "95 %": lambda row: interval(row.estimate(ERROR)),
     "median (mm)": lambda row: f"{np.median(errors(row)):.1f}",
-    "duration error (ms)": lambda row: row.said(DURATION),
-    "ELBO (nats/frame)": lambda row: row.said("ELBO"),
+    "duration error (ms)": lambda row: row.format_score(DURATION),
+    "ELBO (nats/frame)": lambda row: row.format_score("ELBO"),
 }
 INTERPOLATED = {name: partial(falling, name) for name in FALLS}
 
 
-def against(cases: Mapping[str, Row]) -> Table:
-    """Paired differences of vertex errors that should be below zero, with their intervals."""
+def difference_table(cases: Mapping[str, Row]) -> Table:
+    """Return a table of paired differences of vertex errors, expected below zero, with intervals."""
     linear = next(name for name in cases if cases[name].name != OURS)
     pairs = ((FULL, FIRST), (FULL, linear), (FIRST, linear), (SHAPED, FULL))
-    found = {
+    differences = {
         f"{first} minus {second}": cases[first].estimate(ERROR, cases[second])
         for first, second in pairs
         if {first, second} <= cases.keys()
     }
-    return tabled(found, {"vertex error (mm)": lambda each: f"{each.mean:.1f}", "95 %": interval})
+    return tabled(differences, {"vertex error (mm)": lambda each: f"{each.mean:.1f}", "95 %": interval})
 
 
 def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
     """Return a section's two tables for each test set; interpolations are scored on the first only."""
-    first, found = next(iter(cases.values())).runs[0], {}
+    first, available = next(iter(cases.values())).runs[0], {}
     for test in first["tests"]:
-        takes, own = first[test]["clips"], {name: row.of(test) for name, row in cases.items()}
-        spent = budget(cases.values(), first["steps"])
-        done = f"{len(takes)} segments of {len({*takes})} takes. {spent}"
+        takes, rows = first[test]["clips"], {name: row.of(test) for name, row in cases.items()}
+        costs = budget(cases.values(), first["steps"])
+        note = f"{len(takes)} segments of {len({*takes})} takes. {costs}"
         name = f"motion_latent_4d/{folder(section)}-{folder(test)}"
-        found[name] = tabled(own, SCORED | (INTERPOLATED if test == SAME else {}), note=done)
-        found[f"{name}-differences"] = against(own)
-    return found
+        available[name] = tabled(rows, SCORED | (INTERPOLATED if test == SAME else {}), note=note)
+        available[f"{name}-differences"] = difference_table(rows)
+    return available
 
 
 def main(
@@ -178,8 +182,8 @@ def main(
     torch.set_num_threads(1)
     for section in sections if data else ():
         measure(runs / folder(section), cases or SECTIONS[section], seeds, partial(run, section, data, other, steps))
-    there = {name: rows_of(runs / folder(name), name) for name in SECTIONS}
-    for name, rows in there.items():
+    rows_by_section = {name: rows_of(runs / folder(name), name) for name in SECTIONS}
+    for name, rows in rows_by_section.items():
         if rows:
             write(results, tables(name, rows))
 

@@ -16,50 +16,50 @@ from nbclient import NotebookClient
 from PIL import Image
 
 ROOT = Path(__file__).parents[2]
-# sequences have fewer steps than training
+# numbers of three digits: training steps, but not the steps of sequences
 SHARED = re.compile(
     r"(\b(?:steps|particles|samples|fitting|warm_up)=|\b(?:Stage|draw)\(|\"warm_up\": )(\d{3,}|(?<=samples=)\d\d)"
 )
-CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.35  # a share of them, so that every split has some
+CLIPS, FEWEST = re.compile(r"(\bclips=)(\d{2,})"), 0.35  # at least this share of clips, so that no split is empty
 SEEDS = re.compile(r"(\bseeds=)(\d+)")
 TEXTS = ("text/plain", "text/html", "text/latex")
 
 
 CLEAR = "%reset -f\nimport matplotlib.pyplot, pyro\nmatplotlib.pyplot.close('all')\npyro.clear_param_store()"
-"""What a kernel is told before another notebook."""
+"""Code that clears a kernel before the next notebook."""
 SHORT = """
 from functools import partial
 from dvae.models.motion import energies
 from dvae.motion.metric_models.pose_prior import fit_pose_prior
 energies.fit_pose_prior = partial(fit_pose_prior, steps={steps})
 %reset -f"""
-"""And where it trains less: methods that fit a pose prior first do not tell its steps."""
+"""Code that shortens the fit of pose priors, whose steps no notebook sets."""
 
 
 def kernel() -> KernelManager:
-    """A kernel that has not begun, for one notebook after the other."""
-    found = KernelManager(kernel_name="python3")
-    own = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    env = {**os.environ, **own, "PYTHONWARNINGS": "ignore:IProgress not found"}  # tqdm misses ipywidgets
-    found.start_kernel(env=env, cwd=str(ROOT))
-    return found
+    """Start a kernel that runs notebooks one after the other."""
+    manager = KernelManager(kernel_name="python3")
+    variables = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    env = {**os.environ, **variables, "PYTHONWARNINGS": "ignore:IProgress not found"}  # tqdm misses ipywidgets
+    manager.start_kernel(env=env, cwd=str(ROOT))
+    return manager
 
 
 def execute(path: Path, share: float = 1.0, on: KernelManager | None = None) -> nbformat.NotebookNode:
-    """A notebook run from top to bottom, without what varies.
+    """Run a notebook from top to bottom, and remove outputs that vary between runs.
 
     Args:
         path: the notebook.
-        share: of the steps of training, of particles, samples and seeds, and of simulated clips a third at least; fewer
-            change no more than numbers and pictures.
-        on: a kernel, which is cleared before; one of its own without.
+        share: fraction of training steps, particles, samples and seeds, and of at least a third of the simulated clips;
+            it changes only numbers and pictures.
+        on: kernel to clear and use; None starts a new one.
     """
     notebook = nbformat.read(path, as_version=4)
     sources = [cell.source for cell in notebook.cells]
     for cell in notebook.cells:
         for pattern, part in ((SHARED, share), (SEEDS, share), (CLIPS, max(share, FEWEST))):
             cell.source = pattern.sub(
-                lambda found, part=part: f"{found[1]}{max(int(part * int(found[2])), 2)}", cell.source
+                lambda match, part=part: f"{match[1]}{max(int(part * int(match[2])), 2)}", cell.source
             )
     short = SHORT.format(steps=max(int(1000 * share), 2)) if share < 1 else ""
     notebook.cells.insert(0, nbformat.v4.new_code_cell(CLEAR + short))
@@ -101,11 +101,13 @@ def check(path: Path, on: KernelManager) -> None:
     stored, run = nbformat.read(path, as_version=4), execute(path, share=0.02, on=on)
     code = ([cell for cell in each.cells if cell.cell_type == "code"] for each in (stored, run))
     for before, now in zip(*code, strict=True):
-        assert shown(before) == shown(now), f"{now.source}\n\nshows other things than are stored; run `make notebooks`"
+        assert reproducible_outputs(before) == reproducible_outputs(now), (
+            f"{now.source}\n\noutputs differ from the stored ones; run `make notebooks`"
+        )
 
 
 def _small(picture: str) -> str:
-    """A PNG in base64 with 256 colours, a third as large."""
+    """Return a PNG in base64 with 256 colours, which is about a third as large."""
     file = io.BytesIO()
     with Image.open(io.BytesIO(base64.b64decode(picture))) as image:
         image.convert("RGB").quantize(256).save(file, format="png", optimize=True)
@@ -114,25 +116,25 @@ def _small(picture: str) -> str:
 
 def _kept(outputs: list[nbformat.NotebookNode]) -> list[nbformat.NotebookNode]:
     """Return outputs without progress bars, with consecutive text of a stream joined."""
-    whole: list[nbformat.NotebookNode] = []
+    joined: list[nbformat.NotebookNode] = []
     for output in outputs:
         data = output.get("data", {})
         if "application/vnd.jupyter.widget-view+json" in data:
             continue
-        if whole and output.output_type == "stream" and output.name == whole[-1].get("name"):
-            whole[-1].text += output.text
+        if joined and output.output_type == "stream" and output.name == joined[-1].get("name"):
+            joined[-1].text += output.text
         else:
-            whole.append(output)
-    return whole
+            joined.append(output)
+    return joined
 
 
-def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
+def reproducible_outputs(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
     """Return the reproducible part of a cell's outputs: their kinds, and texts without rounding-dependent numbers.
 
     Figures count as present or absent. Texts keep words and whole numbers, except percentages. Tables may be
     sorted by their numbers and keep only words, without fingerprints.
     """
-    found = []
+    outputs = []
     for output in cell.get("outputs", []):
         data = dict(output.get("data", {}))
         if "text" in output:
@@ -140,14 +142,14 @@ def shown(cell: nbformat.NotebookNode) -> list[tuple[str, dict[str, str]]]:
         if len(data) > 1:
             data["text/plain"] = ""  # pages show the richer format
         texts = {kind: _stable(text) if kind in TEXTS else "" for kind, text in data.items()}
-        found.append((output.get("name") or output["output_type"], texts))
-    return found
+        outputs.append((output.get("name") or output["output_type"], texts))
+    return outputs
 
 
 def _stable(text: str) -> str:
     text = re.sub('src="data:[^"]*"', "", text)  # a picture
     if "<pre" in text or "━" in text:
-        # notes below a table depend on its numbers, and so does whether a part of a gap is a lower bound
+        # numbers of a table change its notes, and the mark of parts of a gap that are lower bounds
         plain = re.sub("<[^>]*>", "", text).replace(", at least", "")
         rows = [line for line in plain.splitlines() if re.search("[│┃]", line)]
         return " ".join(sorted(re.findall(r"\b[^\W\d_]{2,}\b", " ".join(rows))))

@@ -28,11 +28,11 @@ METHODS: dict[str, dict[str, Any]] = {
     "srnn": {"residual": 0.9, "scheduled_sampling": 0.0},
     "hit-dvae": {"loss": "evidence", "heading": True, "scheduled_sampling": 0.0},
 }
-"""With options that suit teacher-forced filling; the rest are the presets."""
+"""Options for teacher-forced imputation; the others are the presets."""
 STEPS = {"srnn": 1500, "hit-dvae": 250}
 NEIGHBOURS = 10
 LENGTHS = ((1, 10), (11, 30), (31, None))
-"""Frames of a burst, as far as it lies in the window."""
+"""Ranges of the length of gaps inside the window, in frames."""
 
 
 def bursts(mask: Tensor) -> Tensor:
@@ -44,29 +44,31 @@ def bursts(mask: Tensor) -> Tensor:
 
 
 def neighbours(windows: motion.Windows, training: motion.Windows, batch: Mapping[str, Tensor]) -> Tensor:
-    """The mean of the nearest training windows, by what both have over all frames, all turned to one heading."""
+    """Return the mean of the nearest training windows, by their common entries and at one heading."""
     view = motion.Heading(windows.skeleton, windows.protocol.observed)
 
-    def turned(each: Mapping[str, Tensor]) -> dict[str, Any]:
+    def aligned(each: Mapping[str, Tensor]) -> dict[str, Any]:
         return view(Batch({**each, "mask": {"x": each["mask"]}}))
 
-    given, known = turned(batch), turned(training.all())
-    gaps = [each["mask"]["x"].flatten(1) for each in (given, known)]
-    nearest = distances(given["x"].flatten(1), known["x"].flatten(1), *gaps).topk(NEIGHBOURS, largest=False).indices
-    filled = interpolate_missing(known["x"], known["mask"]["x"])
-    means = torch.stack([filled[some].mean(0) for some in nearest])
-    return view.inverse({"x": means, "heading": given["heading"]})["x"]
+    queries, candidates = aligned(batch), aligned(training.all())
+    gaps = [each["mask"]["x"].flatten(1) for each in (queries, candidates)]
+    nearest = (
+        distances(queries["x"].flatten(1), candidates["x"].flatten(1), *gaps).topk(NEIGHBOURS, largest=False).indices
+    )
+    interpolated = interpolate_missing(candidates["x"], candidates["mask"]["x"])
+    means = torch.stack([interpolated[some].mean(0) for some in nearest])
+    return view.inverse({"x": means, "heading": queries["heading"]})["x"]
 
 
 def imputed(model: Any, batch: Mapping[str, Tensor], samples: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Mean over draws, and spread of a joint, (N, T, D) and (N, T, J)."""
+    """Return the mean over draws (N, T, D) and the spread of each joint (N, T, J)."""
     means, spreads = [], []
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for rows in torch.arange(len(batch["x"])).split(64):
-            drawn = model.impute({name: value[rows] for name, value in batch.items()}, samples, draw=False)["x"]
-            means.append(drawn.mean(0))
-            spreads.append(drawn.var(0).unflatten(-1, (-1, 3)).sum(-1).sqrt())
+            filled = model.impute({name: value[rows] for name, value in batch.items()}, samples, draw=False)["x"]
+            means.append(filled.mean(0))
+            spreads.append(filled.var(0).unflatten(-1, (-1, 3)).sum(-1).sqrt())
     return torch.cat(means), torch.cat(spreads)
 
 
@@ -79,14 +81,14 @@ def sums(values: Tensor, gaps: Tensor, places: np.ndarray) -> np.ndarray:
 
 def cells(means: np.ndarray, weights: np.ndarray) -> list[str]:
     """Return means over hidden entries with their standard errors, clustered by clip."""
-    found = []
-    for own, weight in zip(means, weights, strict=True):
-        mean, deviations = linearised(own, np.maximum(weight, 1e-9))
-        found.append(f"{mean:.1f} ± {clustered_variance(deviations) ** 0.5:.1f}" if weight.any() else "–")
-    return found
+    formatted = []
+    for values, weight in zip(means, weights, strict=True):
+        mean, deviations = linearised(values, np.maximum(weight, 1e-9))
+        formatted.append(f"{mean:.1f} ± {clustered_variance(deviations) ** 0.5:.1f}" if weight.any() else "–")
+    return formatted
 
 
-def fitted(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
+def fit_method(name: str, data: motion.MotionData, steps: int, seed: int) -> Any:
     """Fit a method to the observed entries."""
     train = data.windows("train")
     torch.manual_seed(seed)
@@ -115,16 +117,16 @@ def main(
         results: folder of the tables, such as benchmarks/results; None prints them.
         protocol: name of the protocol that cuts and splits windows.
         share: hidden fraction of the joints.
-        length: frames of a burst.
+        length: mean length of a burst, in frames.
         stride: frames between test windows.
-        seeds: fits of each method.
-        samples: draws of the latents that are averaged.
-        steps: share of the steps of training.
+        seeds: number of fits of each method.
+        samples: number of draws of the latents to average.
+        steps: fraction of the training steps.
     """
-    whole = motion.read_motion(data)
-    opened = motion.MotionData(str(data), motion.occlude(whole, share, length), motion.PROTOCOLS[protocol])
-    test, training = opened.windows("test"), opened.windows("train+validation")
-    batch, truth = test.all(stride), motion.windows(whole, opened.protocol, "test").all(stride)["x"]
+    recording = motion.read_motion(data)
+    dataset = motion.MotionData(str(data), motion.occlude(recording, share, length), motion.PROTOCOLS[protocol])
+    test, training = dataset.windows("test"), dataset.windows("train+validation")
+    batch, truth = test.all(stride), motion.windows(recording, dataset.protocol, "test").all(stride)["x"]
     places = clip_index(test.index(stride)).numpy()
     gaps = bursts(batch["mask"]).unflatten(-1, (-1, 3))[..., 0]
 
@@ -136,7 +138,7 @@ def main(
     def errors(x: Tensor) -> np.ndarray:
         return means((x - truth).unflatten(-1, (-1, 3)).norm(dim=-1))
 
-    made = {
+    errors_by_method = {
         "straight line": [errors(interpolate_missing(batch["x"], batch["mask"]))],
         f"{NEIGHBOURS} neighbours": [errors(neighbours(test, training, batch))],
     }
@@ -144,23 +146,23 @@ def main(
     for name in METHODS:
         for seed in range(seeds):
             start = time.process_time()
-            model = fitted(name, opened, max(round(steps * STEPS[name]), 1), seed)
+            model = fit_method(name, dataset, max(round(steps * STEPS[name]), 1), seed)
             print(f"{name}, seed {seed}: fitted in {time.process_time() - start:.0f} s of processor time", flush=True)
             mean, spread = imputed(model, batch, samples, seed)
-            made.setdefault(name, []).append(errors(mean))
+            errors_by_method.setdefault(name, []).append(errors(mean))
             spreads.setdefault(name, []).append(means(spread))
 
-    def over(found: list[np.ndarray]) -> list[str]:
-        return [f"{np.average(each[0], weights=weights[0]):.1f}" for each in found]
+    def over(by_seed: list[np.ndarray]) -> list[str]:
+        return [f"{np.average(each[0], weights=weights[0]):.1f}" for each in by_seed]
 
     ranges = ["all", *(f"{low} to {high}" if high else f"{low} or more" for low, high in LENGTHS)]
     rows, differences = [], []
-    for name, found in made.items():
-        average, spread = np.mean(found, 0), over([np.mean(spreads[name], 0)]) if name in spreads else ["–"]
-        rows.append([name, *cells(average, weights), *spread, ", ".join(over(found)) if name in spreads else "–"])
-        differences.append([name, *cells(average - made["straight line"][0], weights)])
-    said = f"{len(truth)} windows of {len(set(places))} clips, {int(weights[0].sum()):,} hidden joint positions."
-    scores = Table(["", *ranges, "spread", "seeds"], rows, said)
+    for name, by_seed in errors_by_method.items():
+        average, spread = np.mean(by_seed, 0), over([np.mean(spreads[name], 0)]) if name in spreads else ["–"]
+        rows.append([name, *cells(average, weights), *spread, ", ".join(over(by_seed)) if name in spreads else "–"])
+        differences.append([name, *cells(average - errors_by_method["straight line"][0], weights)])
+    note = f"{len(truth)} windows of {len(set(places))} clips, {int(weights[0].sum()):,} hidden joint positions."
+    scores = Table(["", *ranges, "spread", "seeds"], rows, note)
     others = Table(["minus straight line", *ranges], differences[1:])
     write(results, {"occlusion/errors": scores, "occlusion/differences": others})
 

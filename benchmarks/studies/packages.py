@@ -1,7 +1,7 @@
-"""Draws docs/img/packages.png of docs/project/architecture.md: packages as boxes, who imports whom as edges.
+"""Draw docs/img/packages.png of docs/project/architecture.md: packages as boxes, imports as edges.
 
-It is drawn from the imports in the files. Every box is above all that it imports; an edge that others make
-superfluous is left out, and one upward, which there should not be, is red.
+The imports come from the files. Every box is above the boxes that it imports. Edges that follow from others are left
+out. Edges that point upward are errors in the layout, and are red.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .results import DOCS
 
 ROOT = DOCS.parent / "dvae"
 EVERYWHERE = {"command", "files", "options", "locking", "lazy", "constants"}
-"""Small modules that many use and nobody looks for."""
+"""Small modules that many packages use; the picture leaves them out."""
 
 WALK = {
     "motion": "files to windows",
@@ -32,9 +32,9 @@ WALK = {
     "distributions": "features to distributions",
     "inference": "a run to bound and step",
 }
-"""From x in a file to the loss, in this order."""
+"""Packages on the way from x in a file to the loss, in this order."""
 
-SAYS = {
+CAPTIONS = {
     "cli": "the program dvae",
     "runs": "directories of fits",
     "testing": "tests for your models",
@@ -44,14 +44,14 @@ SAYS = {
 
 
 def package(module: str) -> str:
-    """The package that a module is in: a.b of dvae.a.b is "a"; of dvae itself, nothing."""
+    """Return the package of a module: "a" for dvae.a.b, "" for dvae."""
     return module.split(".")[1] if "." in module else ""
 
 
 def imports() -> nx.DiGraph:
     """Return the graph of imports between packages; the attribute "lines" of a node is its number of lines."""
     graph = nx.DiGraph()
-    for file in sorted(glob("**/*.py", root_dir=ROOT, recursive=True)):  # which goes through links too
+    for file in sorted(glob("**/*.py", root_dir=ROOT, recursive=True)):  # follows symbolic links
         parts = ("dvae", *Path(file).with_suffix("").parts)
         here, text = package(".".join(parts)), (ROOT / file).read_text(encoding="utf-8")
         if here in EVERYWHERE | {"__init__"}:
@@ -70,16 +70,16 @@ def imports() -> nx.DiGraph:
     return graph
 
 
-def storeys(graph: nx.DiGraph) -> list[list[str]]:
-    """Packages from the ground up, each on the lowest floor that is above all that it imports; circles share one."""
+def levels_of(graph: nx.DiGraph) -> list[list[str]]:
+    """Return packages by level, each on the lowest level above its imports; import cycles share a level."""
     circles = nx.condensation(graph)
     floors = nx.topological_generations(circles.reverse())
     return [sorted(name for circle in floor for name in circles.nodes[circle]["members"]) for floor in floors]
 
 
 def draw(graph: nx.DiGraph, ax: Axes) -> None:
-    """Boxes on their floors, edges down."""
-    floors, width, height = storeys(graph), 2.3, 0.62
+    """Draw packages as boxes on their levels, with imports as edges."""
+    floors, width, height = levels_of(graph), 2.3, 0.62
     places: dict[str, tuple[float, float]] = {}
     for level, floor in enumerate(floors):
         known = {n: [places[m][0] for m in graph.successors(n) if m in places] for n in floor}
@@ -114,8 +114,8 @@ def draw(graph: nx.DiGraph, ax: Axes) -> None:
         box.set(facecolor=face, edgecolor=edge, linewidth=1.2, zorder=2)
         ax.add_patch(box)
         ax.text(x, y + 0.1, name, ha="center", va="center", fontsize=11, fontweight="bold", zorder=3)
-        says = WALK.get(name) or SAYS.get(name, "")
-        ax.text(x, y - 0.15, says, ha="center", va="center", fontsize=8, color="0.25", zorder=3)
+        caption = WALK.get(name) or CAPTIONS.get(name, "")
+        ax.text(x, y - 0.15, caption, ha="center", va="center", fontsize=8, color="0.25", zorder=3)
         if walked:
             spot = {"boxstyle": "circle,pad=0.25", "facecolor": edge, "edgecolor": "white"}
             ax.text(
@@ -130,13 +130,13 @@ def draw(graph: nx.DiGraph, ax: Axes) -> None:
 
 @styled
 def main(out: Path = DOCS / "img" / "packages.png") -> None:
-    """Draw.
+    """Draw the picture.
 
     Args:
-        out: where the picture goes.
+        out: file of the picture.
     """
     graph = imports()
-    figure = new_figure(7, len(storeys(graph)))
+    figure = new_figure(7, len(levels_of(graph)))
     draw(graph, figure.subplots())
     figure.savefig(out, dpi=200)
 

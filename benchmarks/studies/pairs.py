@@ -5,13 +5,13 @@ from pathlib import Path
 import tyro
 
 from .engine import cell
-from .ranking import COLUMNS, JUDGED, SCORES, SETS, View, entries
+from .ranking import COLUMNS, METRIC_MODEL_COLUMNS, SCORES, SETS, View, entries
 from .results import Table, write
 
 
 def differences(first: str, second: str, scores: Path) -> Table:
     """Return a table with a row of the first method's scores minus the second's for each set."""
-    columns, lines = [*COLUMNS, *JUDGED], []
+    columns, lines = [*COLUMNS, *METRIC_MODEL_COLUMNS], []
     for name, selected in SETS.items():
         if View() in selected.views:
             rows = entries(scores, name, View(), (first, second))

@@ -37,21 +37,21 @@ from .ranking import (
     Accelerator,
     View,
     entries,
-    titled,
-    trained,
+    row_label,
+    training_cells,
     work,
 )
 from .results import DOCS, Table, refuse_unknown, write
 
 
 def published() -> dict[str, dict[str, dict[str, str]]]:
-    """Tables of the papers by name: rows by their names, cells by columns."""
-    found: dict[str, dict[str, dict[str, str]]] = {}
+    """Read the published tables by name: rows by name, cells by column."""
+    tables: dict[str, dict[str, dict[str, str]]] = {}
     for name, printed in settings(str(Path(__file__).with_name("published"))).items():
         lines = (line.split("|") for line in printed["rows"].splitlines())
         columns = printed["columns"].split(",")
-        found[name] = {row.strip(): dict(zip(columns, cells.split(), strict=True)) for row, cells in lines}
-    return found
+        tables[name] = {row.strip(): dict(zip(columns, cells.split(), strict=True)) for row, cells in lines}
+    return tables
 
 
 PUBLISHED = published()
@@ -81,7 +81,10 @@ class Further:
 
     def views_of(self, row: str) -> list[View]:
         """Return the views of a row in this table."""
-        return [*(self.views if row in self.rows else ()), *(view for own, view in self.apart.values() if own == row)]
+        return [
+            *(self.views if row in self.rows else ()),
+            *(view for named_row, view in self.apart.values() if named_row == row),
+        ]
 
 
 @dataclass(frozen=True)
@@ -89,13 +92,13 @@ class Paper:
     """A paper's tables.
 
     Args:
-        set: of `SETS`, on which rows are fitted.
-        rows: to options of the method, as of `ranking.FUTURES`; the first is the paper's own.
-        columns: of each table of scores, by its name.
-        changes: rows, each with the one that it is compared with.
+        set: name in `SETS` of the set to fit the rows on.
+        rows: options of the method by row, as in `ranking.FUTURES`; the first row is the paper's method.
+        columns: columns of each table of scores, by name of the table.
+        changes: pairs of rows to compare.
         compared: columns of the table of changes.
         printed: rows of the paper.
-        views: of all rows; those with paths have a line for each.
+        views: views of all rows; each number of given paths has its own line.
         further: views of some rows.
     """
 
@@ -113,93 +116,117 @@ class Paper:
         return list(dict.fromkeys([*self.views, *(view for each in self.further for view in each.views_of(row))]))
 
 
-def further(
-    views: Sequence[Mapping[str, Any]], printed: str = "", apart: Mapping[str, Any] = MappingProxyType({}), **told: Any
+def read_further(
+    views: Sequence[Mapping[str, Any]],
+    printed: str = "",
+    apart: Mapping[str, Any] = MappingProxyType({}),
+    **fields: Any,
 ) -> Further:
-    """Views of some rows, as the file has them."""
-    own = {called: (row, View(**view)) for called, (row, view) in apart.items()}
-    return Further(views=[View(**view) for view in views], printed=PUBLISHED.get(printed, {}), apart=own, **told)
+    """Return further views from their table in the TOML file."""
+    separate = {called: (row, View(**view)) for called, (row, view) in apart.items()}
+    return Further(views=[View(**view) for view in views], printed=PUBLISHED.get(printed, {}), apart=separate, **fields)
 
 
-def paper(name: str, told: Mapping[str, Any]) -> Paper:
-    """A paper's tables, as the file has them."""
-    rows = {row: {**(FUTURES | PATHS).get(row, {}), **options} for row, options in told["rows"].items()}
-    own = {"views": [View(**view) for view in told["views"]], "further": [further(**each) for each in told["further"]]}
-    return Paper(printed=PUBLISHED[name], **{**told, **own, "rows": rows})
+def paper(name: str, fields: Mapping[str, Any]) -> Paper:
+    """Return a paper's tables from their table in the TOML file."""
+    rows = {row: {**(FUTURES | PATHS).get(row, {}), **options} for row, options in fields["rows"].items()}
+    views = {
+        "views": [View(**view) for view in fields["views"]],
+        "further": [read_further(**each) for each in fields["further"]],
+    }
+    return Paper(printed=PUBLISHED[name], **{**fields, **views, "rows": rows})
 
 
-PAPERS = {name: paper(name, told) for name, told in settings(__file__).items()}
+PAPERS = {name: paper(name, fields) for name, fields in settings(__file__).items()}
 
 
-Found = Mapping[View, Mapping[str, Row]]
+RowsByView = Mapping[View, Mapping[str, Row]]
 
 
-def scores(found: Found, columns: Sequence[str], beside: Mapping[str, Mapping[str, str]], note: str = "") -> Table:
+def scores(
+    rows_by_view: RowsByView, columns: Sequence[str], published_rows: Mapping[str, Mapping[str, str]], note: str = ""
+) -> Table:
     """Return a table of rows in each view, followed by published rows; references use no given paths."""
     lines = []
-    views = list(found)
-    what = "given" if views[0].given is not None else "observed" if views[0].observed else ""
-    for row in dict.fromkeys(row for each in found.values() for row in each):
-        seen = [view for view in views if row in found[view]]
-        for view in seen[:1] if what == "given" and not found[seen[0]][row].trained else seen:
-            entry = found[view][row]
-            told = [str(vars(view)[what]) if entry.trained or what != "given" else ""] if what else []
-            lines.append([titled(row, entry), *told, *trained(entry), *map(cell, map(entry.estimate, columns))])
-    for row, cells in beside.items():
+    views = list(rows_by_view)
+    condition = "given" if views[0].given is not None else "observed" if views[0].observed else ""
+    for row in dict.fromkeys(row for each in rows_by_view.values() for row in each):
+        row_views = [view for view in views if row in rows_by_view[view]]
+        for view in (
+            row_views[:1] if condition == "given" and not rows_by_view[row_views[0]][row].trained else row_views
+        ):
+            entry = rows_by_view[view][row]
+            has_value = entry.trained or condition != "given"
+            value = [str(vars(view)[condition]) if has_value else ""] if condition else []
+            lines.append(
+                [row_label(row, entry), *value, *training_cells(entry), *map(cell, map(entry.estimate, columns))]
+            )
+    for row, cells in published_rows.items():
         if all(cells.get(column, "–") == "–" for column in columns):
             continue
-        name, _, given = row.rpartition(", ") if what else (row, "", "")
-        lines.append([f"*{name}*", *([given] if what else []), "", "", *(cells.get(column, "–") for column in columns)])
-    return Table(["", *([what] if what else []), *TRAINED, *columns], lines, note)
+        name, _, printed = row.rpartition(", ") if condition else (row, "", "")
+        value = [printed] if condition else []
+        lines.append([f"*{name}*", *value, "", "", *(cells.get(column, "–") for column in columns)])
+    return Table(["", *([condition] if condition else []), *TRAINED, *columns], lines, note)
 
 
-def changes(found: Found, paper: Paper) -> Table:
+def changes(rows_by_view: RowsByView, paper: Paper) -> Table:
     """Return a table of paired differences; columns are scores, or views if there are several."""
 
     def change(view: View, pair: tuple[str, str], column: str) -> str:
-        having, lacking = (found[view].get(row) for row in pair)
-        change = having.estimate(column, lacking) if having is not None and lacking is not None else None
+        with_change, without_change = (rows_by_view[view].get(row) for row in pair)
+        if with_change is None or without_change is None:
+            return "–"
+        change = with_change.estimate(column, without_change)
         return "–" if change is None else str(change)
 
     note = "What each change does, paired."
-    pairs = [pair for pair in paper.changes if all(pair[0] in each for each in found.values())]
-    if len(found) == 1:
-        (view,) = found
+    pairs = [pair for pair in paper.changes if all(pair[0] in each for each in rows_by_view.values())]
+    if len(rows_by_view) == 1:
+        (view,) = rows_by_view
         lines = [[*pair, *(change(view, pair, column) for column in paper.compared)] for pair in pairs]
         return Table(["", "minus", *paper.compared], lines, note)
     lines = [
-        [*pair, column, *(change(view, pair, column) for view in found)] for pair in pairs for column in paper.compared
+        [*pair, column, *(change(view, pair, column) for view in rows_by_view)]
+        for pair in pairs
+        for column in paper.compared
     ]
-    return Table(["", "minus", "score", *(f"{view.given} given" for view in found)], lines, note)
+    return Table(["", "minus", "score", *(f"{view.given} given" for view in rows_by_view)], lines, note)
 
 
-def more_joints(found: Found, paper: Paper) -> Table:
-    """What each further path changes, paired."""
-    views, lines = list(found), []
+def more_joints(rows_by_view: RowsByView, paper: Paper) -> Table:
+    """Return a table of paired differences for each additional path."""
+    views, lines = list(rows_by_view), []
     for row in paper.rows:
-        if all(row in each for each in found.values()):
-            steps = [(found[more][row], found[fewer][row]) for more, fewer in zip(views[1:], views, strict=False)]
+        if all(row in each for each in rows_by_view.values()):
+            steps = [
+                (rows_by_view[more][row], rows_by_view[fewer][row])
+                for more, fewer in zip(views[1:], views, strict=False)
+            ]
             for column in paper.compared:
-                crossed = (more.crossed(column, fewer) for more, fewer in steps)
-                lines.append([row, column, *(cell(each and each.estimate()) for each in crossed)])
+                differences = (more.two_way_errors(column, fewer) for more, fewer in steps)
+                lines.append([row, column, *(cell(each and each.estimate()) for each in differences)])
     header = [f"{JOINTS[view.given]} too" for view in views[:-1] if view.given is not None]
     return Table(["", "score", *header], lines, "What each further path does, paired.")
 
 
 PATHED = ("ADE", "FDE", "energy score")
-"""Scores that are drawn by the number of paths."""
+"""Scores in the picture, by number of paths."""
 
 
 @styled
-def drawn(found: Found, paper: Paper) -> Figure:
-    """Scores by how many paths are given, of the seeds that have all, with intervals over clips, and these seeds."""
+def draw_scores(rows_by_view: RowsByView, paper: Paper) -> Figure:
+    """Draw scores by number of given paths, over the seeds with all of them; intervals are over clips and seeds."""
     figure = new_figure(7, 2.9)
     for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
         for row in (NEIGHBOURS, *paper.rows):
-            own = {view.given: rows[row] for view, rows in found.items() if row in rows}
-            common = min((len(entry.runs) for entry in own.values()), default=0)
-            seen = {given: replace(each, runs=each.runs[:common]).estimate(column) for given, each in own.items()}
-            scores = {given: score for given, score in seen.items() if score is not None}
+            entries_by_count = {view.given: rows[row] for view, rows in rows_by_view.items() if row in rows}
+            common = min((len(entry.runs) for entry in entries_by_count.values()), default=0)
+            estimates = {
+                count: replace(each, runs=each.runs[:common]).estimate(column)
+                for count, each in entries_by_count.items()
+            }
+            scores = {count: score for count, score in estimates.items() if score is not None}
             means = [score.mean for score in scores.values()]
             if row == NEIGHBOURS:
                 panel.axhline(means[0], color="0.5", lw=1, ls="--", label=row)
@@ -244,25 +271,25 @@ def main(
     for name in papers:
         paper = PAPERS[name]
         if data is not None:
-            fitted = {row: options for row, options in paper.rows.items() if not rows or row in rows}
-            views = {row: paper.views_of(row) for row in fitted}
-            work(data, runs, stored, paper.set, fitted, views, seeds, samples, accelerator)
-        found = {view: entries(stored, paper.set, view, paper.rows) for view in paper.views}
-        tables = {key: scores(found, columns, paper.printed) for key, columns in paper.columns.items()}
-        tables["changes"] = changes(found, paper)
-        if len(found) > 1:
-            tables["further-paths"] = more_joints(found, paper)
+            selected = {row: options for row, options in paper.rows.items() if not rows or row in rows}
+            views = {row: paper.views_of(row) for row in selected}
+            work(data, runs, stored, paper.set, selected, views, seeds, samples, accelerator)
+        rows_by_view = {view: entries(stored, paper.set, view, paper.rows) for view in paper.views}
+        tables = {key: scores(rows_by_view, columns, paper.printed) for key, columns in paper.columns.items()}
+        tables["changes"] = changes(rows_by_view, paper)
+        if len(rows_by_view) > 1:
+            tables["further-paths"] = more_joints(rows_by_view, paper)
             if results is not None:
                 more = (view for each in paper.further for view in each.views if view == View(view.given))
-                seen = {view: entries(stored, paper.set, view, paper.rows) for view in more}
-                drawn(found | seen, paper).savefig(pictures / f"{name}.png", dpi=200)
+                more_rows = {view: entries(stored, paper.set, view, paper.rows) for view in more}
+                draw_scores(rows_by_view | more_rows, paper).savefig(pictures / f"{name}.png", dpi=200)
         for each in paper.further:
-            seen = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
+            more_rows = {view: rows for view in each.views if (rows := entries(stored, paper.set, view, each.rows))}
             for called, (row, view) in each.apart.items():
                 if own := entries(stored, paper.set, view, [row]).get(row):
-                    seen |= {view: seen.get(view, {}) | {called: own}}
-            for key, columns in ({"": each.columns} if each.columns else paper.columns).items() if seen else ():
-                tables[f"{each.name}-{key}".strip("-")] = scores(seen, columns, each.printed, each.caption)
+                    more_rows |= {view: more_rows.get(view, {}) | {called: own}}
+            for key, columns in ({"": each.columns} if each.columns else paper.columns).items() if more_rows else ():
+                tables[f"{each.name}-{key}".strip("-")] = scores(more_rows, columns, each.printed, each.caption)
         folder = name.replace("-", "_")
         write(results, {f"{folder}/{key}": table for key, table in tables.items() if table.rows})
 

@@ -41,70 +41,72 @@ TUNING = ("active", "elderly", "exhausted")
 
 
 @dataclass(frozen=True)
-class Scored:
-    """Distances of the futures of two unseen styles from a forecaster's.
+class ForecastDistances:
+    """Distances of the true futures of two unseen styles from forecasts.
 
     Args:
-        far: by region, (N, ...).
-        places: (N,), the clip of every window.
-        styles: of every window.
+        distances: distances (N, ...) by region.
+        places: index (N,) of the clip of each window.
+        styles: style of each window.
     """
 
-    far: Mapping[str, torch.Tensor]
+    distances: Mapping[str, torch.Tensor]
     places: torch.Tensor
     styles: np.ndarray
 
     @classmethod
-    def of(cls, windows: motion.Windows, parts: Iterator[tuple[torch.Tensor, torch.Tensor]], spread: Any) -> Scored:
-        """From forecasts (B, K, H, D) and true futures."""
-        apart = torch.cat(
-            [standardised(drawn, true, drawn.std(1) if spread is None else spread) for drawn, true in parts]
+    def of(
+        cls, windows: motion.Windows, parts: Iterator[tuple[torch.Tensor, torch.Tensor]], spread: Any
+    ) -> ForecastDistances:
+        """Return the distances of batches of forecasts (B, K, H, D) and true futures."""
+        distances = torch.cat(
+            [standardised(forecasts, true, forecasts.std(1) if spread is None else spread) for forecasts, true in parts]
         )
-        far = {region: largest_by_region(torch.cat(apart), region) for region in REGIONS}
-        return cls(far, clip_index(windows.keys), np.array(windows.labels("style")))
+        by_region = {region: largest_by_region(torch.cat(distances), region) for region in REGIONS}
+        return cls(by_region, clip_index(windows.keys), np.array(windows.labels("style")))
 
-    def held(self, region: str, kept: np.ndarray, judged: np.ndarray) -> float:
-        """The share of windows of a judged clip that is in prediction bands calibrated on others."""
-        ours, theirs = (self.places[windows].unique(return_inverse=True)[1] for windows in (kept, judged))
-        factor = quantile(self.far[region][kept], ours, LEVEL)
-        inside = (self.far[region][judged] <= factor).double().mean((1, 2))
-        return float(np.mean(clip_means(inside, theirs)))
-
-
-def across(scored: Scored) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Each style calibrates once, and the other one tests."""
-    for style in np.unique(scored.styles):
-        yield scored.styles == style, scored.styles != style
+    def coverage(self, region: str, calibration: np.ndarray, test: np.ndarray) -> float:
+        """Return the mean share over test clips of windows inside the bands of the calibration windows."""
+        clips, test_clips = (self.places[windows].unique(return_inverse=True)[1] for windows in (calibration, test))
+        factor = quantile(self.distances[region][calibration], clips, LEVEL)
+        inside = (self.distances[region][test] <= factor).double().mean((1, 2))
+        return float(np.mean(clip_means(inside, test_clips)))
 
 
-def within(scored: Scored, times: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Random halves of the clips of both styles."""
-    random, clips = np.random.default_rng(0), int(scored.places.max()) + 1
+def splits_by_style(distances: ForecastDistances) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield masks of calibration and test windows: each style calibrates once, the other tests."""
+    for style in np.unique(distances.styles):
+        yield distances.styles == style, distances.styles != style
+
+
+def splits_by_clip(distances: ForecastDistances, times: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield masks of the windows of random halves of the clips of both styles."""
+    random, clips = np.random.default_rng(0), int(distances.places.max()) + 1
     for _ in range(times):
-        half = np.isin(scored.places.numpy(), random.permutation(clips)[: clips // 2])
+        half = np.isin(distances.places.numpy(), random.permutation(clips)[: clips // 2])
         yield half, ~half
 
 
-def row(name: str, found: Sequence[Mapping[str, float]]) -> list[str]:
-    """Means over splits with their standard deviation, and the extremes of whole futures."""
-    shares = {region: np.array([each[region] for each in found]) for region in REGIONS}
+def row(name: str, shares_by_split: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return a row of means and deviations over splits, with minimum and maximum for whole futures."""
+    shares = {region: np.array([each[region] for each in shares_by_split]) for region in REGIONS}
     cells = [f"{each.mean():.1%} ± {each.std(ddof=1):.1%}" for each in shares.values()]
-    return [name, *cells, str(len(found)), f"{shares['future'].min():.1%}", f"{shares['future'].max():.1%}"]
+    return [name, *cells, str(len(shares_by_split)), f"{shares['future'].min():.1%}", f"{shares['future'].max():.1%}"]
 
 
 def futures(
-    held: EvaluationWindows, model: Any, training: motion.Windows
+    windows: EvaluationWindows, model: Any, training: motion.Windows
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """Forecasts and true futures, batch by batch, of a model or a reference."""
-    starts = [slice(start, start + 32) for start in range(0, len(held.keys), 32)]
+    """Yield batches of forecasts and true futures of a model or a reference."""
+    starts = [slice(start, start + 32) for start in range(0, len(windows.keys), 32)]
     if isinstance(model, str):
-        count, forecaster = References(held, SAMPLES, training=training)[model]
-        yield from ((forecasts_of(model, forecaster, count, held, part), held.futures[part]) for part in starts)
+        count, forecaster = References(windows, SAMPLES, training=training)[model]
+        yield from ((forecasts_of(model, forecaster, count, windows, part), windows.futures[part]) for part in starts)
         return
-    forecaster = forecaster_of(model, held, SAMPLES, {"draw_emission": True})
+    forecaster = forecaster_of(model, windows, SAMPLES, {"draw_emission": True})
     with seeded_evaluation(model, 0):
         for part in starts:
-            yield forecasts_of("srnn", forecaster, SAMPLES, held, part), held.futures[part]
+            yield forecasts_of("srnn", forecaster, SAMPLES, windows, part), windows.futures[part]
 
 
 def main(runs: Path, data: Path, results: Path | None = None, models: int = 10, halves: int = 20) -> None:
@@ -118,19 +120,22 @@ def main(runs: Path, data: Path, results: Path | None = None, models: int = 10, 
         halves: number of random halves of the clips for each choice.
     """
     torch.set_num_threads(1)
-    found: dict[str, list[dict[str, float]]] = {}
+    shares_by_row: dict[str, list[dict[str, float]]] = {}
     for styles in sorted(itertools.combinations(STYLES, 3), key=lambda each: each != TUNING)[:models]:
         unseen = tuple(style for style in STYLES if style not in styles)
         protocol = replace(motion.PROTOCOLS["bandai2-tuning"], name="bandai2-styles", split_by="style")
-        opened = MotionData.open(str(data), replace(protocol, train=styles, test=unseen))
+        dataset = MotionData.open(str(data), replace(protocol, train=styles, test=unseen))
         out = runs / "-".join(styles)
         if not out.exists():
-            dvae.fit(dvae.method("srnn", scheduled_sampling=1.0), opened, out=out, **vars(SRNN))
-        apart = replace(opened.protocol, train_stride=EVERY, test_stride=EVERY)
-        windows, training = (motion.windows(opened.motion, apart, split) for split in ("test", "train+validation"))
+            dvae.fit(dvae.method("srnn", scheduled_sampling=1.0), dataset, out=out, **vars(SRNN))
+        thinned = replace(dataset.protocol, train_stride=EVERY, test_stride=EVERY)
+        windows, training = (motion.windows(dataset.motion, thinned, split) for split in ("test", "train+validation"))
         model = dvae.load(out, data).model
         residual = torch.cat(
-            [true - drawn.mean(1) for drawn, true in futures(prepare_windows(training), "zero velocity", training)]
+            [
+                true - forecasts.mean(1)
+                for forecasts, true in futures(prepare_windows(training), "zero velocity", training)
+            ]
         )
         rows = {
             "SRNN": (model, None),
@@ -138,31 +143,39 @@ def main(runs: Path, data: Path, results: Path | None = None, models: int = 10, 
             "zero velocity": ("zero velocity", residual.square().mean(0).sqrt()),
         }
         for name, (forecaster, spread) in rows.items():
-            scored = Scored.of(windows, futures(prepare_windows(windows), forecaster, training), spread)
-            for how, splits in (("another style", across(scored)), ("other clips", within(scored, halves))):
-                shares = [{region: scored.held(region, *split) for region in REGIONS} for split in splits]
-                found.setdefault(f"{name}, calibrated on {how}", []).extend(shares)
+            distances = ForecastDistances.of(windows, futures(prepare_windows(windows), forecaster, training), spread)
+            for calibration, splits in (
+                ("another style", splits_by_style(distances)),
+                ("other clips", splits_by_clip(distances, halves)),
+            ):
+                shares = [{region: distances.coverage(region, *split) for region in REGIONS} for split in splits]
+                shares_by_row.setdefault(f"{name}, calibrated on {calibration}", []).extend(shares)
         if styles == TUNING:
-            write(results, first(model, opened, apart))
-    splits = [row(name, each) for name, each in sorted(found.items())]
+            write(results, tables_of_split(model, dataset, thinned))
+    splits = [row(name, each) for name, each in sorted(shares_by_row.items())]
     write(results, {"calibration/splits": Table(["", *COLUMNS], splits)})
 
 
-def first(model: Any, opened: MotionData, apart: motion.Protocol) -> dict[str, Table]:
-    """Return the tables of one split: calibrated on half of the clips of group B, judged on the other half."""
-    group = replace(apart, split_by="split", train=(), test=("calibration", "judged"))
-    clips = [clip for clip in opened.motion if clip.labels["style"] in apart.test]
-    kept = {clip.key for place, clip in enumerate(clips) if place % 2}
+def tables_of_split(model: Any, dataset: MotionData, thinned: motion.Protocol) -> dict[str, Table]:
+    """Return the tables of one split: half of the clips of group B calibrate, the other half tests."""
+    group = replace(thinned, split_by="split", train=(), test=("calibration", "judged"))
+    clips = [clip for clip in dataset.motion if clip.labels["style"] in thinned.test]
+    odd_clips = {clip.key for place, clip in enumerate(clips) if place % 2}
     halves = []
     for odd in (True, False):
-        own = motion.MotionSet([clip for clip in clips if (clip.key in kept) == odd], opened.motion.skeleton, "half")
+        own = motion.MotionSet(
+            [clip for clip in clips if (clip.key in odd_clips) == odd], dataset.motion.skeleton, "half"
+        )
         halves.append(motion.windows(own, replace(group, test=tuple(own.splits)), "test"))
     bands = dvae.conformal_bands(model, halves[0], LEVEL, samples=SAMPLES, progress=False)
-    judged = bands.coverage(model, halves[1], progress=False)["model"]
+    coverages = bands.coverage(model, halves[1], progress=False)["model"]
     lines = [
         [
             region,
-            *(str(judged[f"{what} 90 %, {region}"]) for what in ("raw", "width raw", "calibrated", "width calibrated")),
+            *(
+                str(coverages[f"{column} 90 %, {region}"])
+                for column in ("raw", "width raw", "calibrated", "width calibrated")
+            ),
         ]
         for region in REGIONS
     ]

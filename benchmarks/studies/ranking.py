@@ -36,20 +36,20 @@ from dvae.motion.data.dataset import MotionData
 from dvae.motion.geometry.parts import UNIONS, body_parts
 from dvae.runs.directory import load
 
-from .engine import Archive, Row, cell, folder, settings, swept
+from .engine import Archive, Row, cell, folder, settings, sweep_seeds
 from .results import DOCS, Table, refuse_unknown, require_gpu, same, write
 
 SCORES = Path(__file__).parents[1] / "scores"
 Accelerator = Literal["cpu", "cuda"]
 
-_TOLD = settings(__file__)
-FUTURES: dict[str, dict[str, Any]] = _TOLD["futures"]
-PATHS: dict[str, dict[str, Any]] = _TOLD["paths"]
-STEPS: dict[str, int] = _TOLD["steps"]
+_SETTINGS = settings(__file__)
+FUTURES: dict[str, dict[str, Any]] = _SETTINGS["futures"]
+PATHS: dict[str, dict[str, Any]] = _SETTINGS["paths"]
+STEPS: dict[str, int] = _SETTINGS["steps"]
 ALIKE, ALIKE_PATHS = (
     {row: {**options, "steps": STEPS[row]} for row, options in methods.items()} for methods in (FUTURES, PATHS)
 )
-"""The same methods, equally long."""
+"""The same methods with the same training time."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,11 @@ class View:
         return motion.ExchangedWindows(conditioned, self.exchanged, own_pose=self.own, truth=self.truth)
 
     def evaluate(self, samples: int) -> dict[str, Any]:
-        """Arguments of `dvae.evaluate`."""
+        """Return arguments of `dvae.evaluate`."""
         return {"samples": 1, "options": {"temperature": 0}} if self.single else {"samples": samples}
 
     def member(self, run: str) -> str:
-        """The name of the scores of a run in an archive."""
+        """Return the name of the scores of a run in an archive."""
         parts = (f"{name}-{value}" for name, value in vars(self).items() if value != getattr(View, name))
         return f"{run}/{'-'.join(['scores', *parts])}.json"
 
@@ -109,7 +109,7 @@ class Set:
         methods: options of the methods by row.
         views: views of each method.
         metric_models: names in `METRIC_MODELS`.
-        like: the set whose protocol, fitted metric models and reference rows it shares; its own where empty.
+        like: name of the set that provides the protocol, metric models and reference rows; empty for its own.
     """
 
     file: str
@@ -131,7 +131,7 @@ SETS = {
     "cmu8-trajectories": Set(CMU, ALIKE_PATHS, GIVEN),
 }
 JOINTS = ("RToe", "LToe", "LWrist", "RWrist")
-"""Whose paths are given first, as in TrajeVAE's tables."""
+"""Joints with given paths, in the order of TrajeVAE's tables."""
 CLASSIFIER = Training(steps=3000, learning_rate=3e-3, decay=0.5, validate_every=250)
 METRIC_MODELS: dict[str, tuple[str, dict[str, Any], Training]] = {
     "prior": ("pose-prior", {"heading": True}, Training(steps=1000, learning_rate=0.01, decay=0.8)),
@@ -140,22 +140,22 @@ METRIC_MODELS: dict[str, tuple[str, dict[str, Any], Training]] = {
 }
 """Metric models, their options and their training."""
 COLUMNS = ("energy score", "ADE", "FDE", "ADEm", "MMADE", "APD", "APDE", "CMD", "limb stretch", "limb jitter")
-JUDGED = ("ACC content", "FID content", "pose NLL")
+METRIC_MODEL_COLUMNS = ("ACC content", "FID content", "pose NLL")
 OTHERS = ("FDEm", "MMFDE", "MMADEm", "MMFDEm", "path error", "global ADE")
-"""Scores that the papers' tables show beside those."""
+"""Further scores in the tables of papers."""
 GROUPED = ("ACC group", "FID group")
 PARTED = tuple(f"APD {part}" for part in UNIONS)
-SHOWN = {*COLUMNS, *JUDGED, *OTHERS, *GROUPED, *PARTED}
+SHOWN = {*COLUMNS, *METRIC_MODEL_COLUMNS, *OTHERS, *GROUPED, *PARTED}
 RANKED = "energy score"
-"""By which rows stand in order; it is proper, and the lowest is best."""
+"""Score that orders the rows: a proper scoring rule, lower is better."""
 NEIGHBOURS = "nearest neighbours"
 ENOUGH = 3
-"""Seeds that a row has which may be called the best: of fewer, what they spread tells next to nothing."""
+"""Number of seeds a row needs to be called the best; fewer seeds estimate their spread poorly."""
 LEVEL = 0.9
-"""Of intervals, and of the set of those that may be the best."""
+"""Level of intervals and of the model confidence set."""
 
 
-def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
+def stored_part(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
     """Return the stored part of an evaluation: scores by clip of a run, or of all reference rows.
 
     Returns:
@@ -181,29 +181,29 @@ def scored(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
 
 
 def fitted_metric_models(data: MotionData, runs: Path, names: Sequence[str] = ("prior", "content")) -> dict[str, Path]:
-    """Run directories of metric models of the training clips, fitted once."""
+    """Fit missing metric models to the training clips, and return the run directories of all."""
     for name in names:
         method, options, training = METRIC_MODELS[name]
-        clips = grouped(data) if options.get("label") == "group" else data
-        (metric_model,) = swept(
+        clips = with_groups(data) if options.get("label") == "group" else data
+        (metric_model,) = sweep_seeds(
             name, registry.metric_models()[method](**options), clips, runs / "metric_models", (0,), training
         )
-        config = metric_model / "config.json"  # is kept, and says nothing of this machine
+        config = metric_model / "config.json"  # stored in the repository, without paths of this machine
         text = config.read_text(encoding="utf-8")
         if (placeless := text.replace(json.dumps(data.path), json.dumps(Path(data.path).name))) != text:
-            with files.atomic_write(config) as new:  # whole at any time, as other processes may read it
+            with files.atomic_write(config) as new:  # atomic, because other processes may read the file
                 new.write(placeless.encode())
     return {name: runs / "metric_models" / f"{name}-seed0" for name in names}
 
 
-def grouped(data: MotionData) -> MotionData:
-    """Clips with the group of their content as a label, too: ways to walk are one, and so are those to wave."""
+def with_groups(data: MotionData) -> MotionData:
+    """Return clips with a label for the group of their content, such as all kinds of walks."""
     labels = [{**clip.labels, "group": clip.labels["content"].split("-")[0]} for clip in data.motion]
     clips = [replace(clip, labels=each) for clip, each in zip(data.motion, labels, strict=True)]
     return replace(data, motion=motion.MotionSet(clips, data.motion.skeleton, data.motion.name, copy=False))
 
 
-def judging(metric_models: Mapping[str, Path]) -> Any:
+def motion_scores(metric_models: Mapping[str, Path]) -> Any:
     """Return the motion scores of the tables, including scores by the given metric models."""
     models = {name: load(path).model for name, path in metric_models.items()}
     prior = models.pop("prior", None)
@@ -223,18 +223,18 @@ def fit(
     prior: Path | None,
     accelerator: Accelerator = "cpu",
 ) -> Path:
-    """The run directory of a method, fitted once; second stages stand on the first of the same seed."""
-    method_options, training = parted({**methods[row], "accelerator": accelerator})
+    """Fit a method if its run is missing, and return the run directory; second stages use the CVAE of the same seed."""
+    method_options, training = split_options({**methods[row], "accelerator": accelerator})
     method = method_options.pop("method", row)
     if method in ("gsps", "hit-dvae") and prior is not None and method_options.get("pose_prior") != 0:
         method_options["pose_prior_run"] = str(prior.absolute())
     if method in ("dlow", "dsf"):
         method_options["cvae_run"] = str(fit(data, "cvae", methods, seed, runs, prior, accelerator).absolute())
-    (path,) = swept(row, dvae.method(method, **method_options), data, runs, (seed,), training)
+    (path,) = sweep_seeds(row, dvae.method(method, **method_options), data, runs, (seed,), training)
     return path
 
 
-def parted(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def split_options(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Split options into options of the method and options of its training."""
     # methods have an option of this name too, which sets the training schedule
     training = Training.__dataclass_fields__.keys() - {"scheduled_sampling"}
@@ -277,18 +277,23 @@ def work(
     def score(path: Path | None, row: str, view: View) -> dict[str, Any]:
         data, by = dataset, metric_models
         if view.metric_models:
-            data, by = grouped(dataset), fitted_metric_models(dataset, stored / like, view.metric_models.split("+"))
-        elif view.observed:  # a pose prior reads windows turned at the last frame that its own protocol observes
+            data, by = with_groups(dataset), fitted_metric_models(dataset, stored / like, view.metric_models.split("+"))
+        elif view.observed:  # a pose prior reads windows rotated at the last observed frame of its own protocol
             by = {metric_model: run for metric_model, run in metric_models.items() if metric_model != "prior"}
         models = {} if path is None else {row: load(path).model.to(accelerator)}
         extra: dict[str, Any] = {"training_windows": view.windows(data, "train+validation")}
         options = {"references": False} if models else extra
-        windows, told = view.windows(data, "test"), view.evaluate(samples)
+        windows, options_of_view = view.windows(data, "test"), view.evaluate(samples)
         if view.parts:
-            ways: dict[str, Any] = {"held": Held, "nearest": partial(Nearest, lower=places(windows)["lower"])}
-            models = {name: ways.get(view.parts, lambda free: free)(model) for name, model in models.items()}
-        scores = diversities if view.parts else judging(by)
-        return scored(dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **told), path)
+            wrappers: dict[str, Any] = {
+                "held": FixedLowerBody,
+                "nearest": partial(NearestLowerBody, lower=coordinates_of_parts(windows)["lower"]),
+            }
+            models = {name: wrappers.get(view.parts, lambda free: free)(model) for name, model in models.items()}
+        scores = diversities if view.parts else motion_scores(by)
+        return stored_part(
+            dvae.evaluate(models, windows, scores=scores, batch_size=64, **options, **options_of_view), path
+        )
 
     references = archive(stored, like)
     for view in dict.fromkeys(view for each in views.values() for view in each):
@@ -304,8 +309,8 @@ def work(
                 store.add(member, score(path, row, view))
 
 
-class Wrapped(nn.Module):
-    """What forecasts by a model."""
+class WrappedModel(nn.Module):
+    """Wrap a model for forecasts; subclasses implement `forecast`."""
 
     likelihood = False
 
@@ -314,16 +319,16 @@ class Wrapped(nn.Module):
         self.model, self.generative, self.inference = model, model.generative, model.inference
 
 
-class Held(Wrapped):
-    """A model whose futures share the first one's draw of the lower body."""
+class FixedLowerBody(WrappedModel):
+    """A model whose futures share the lower-body latent of the first draw."""
 
     def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
-        """Futures, of a model that has a latent of the lower body."""
+        """Return futures of a model with the latent `lower`."""
         lower = self.model.forecast(past, horizon, 1, **options)["lower"][0]
         return self.model.forecast(past, horizon, samples, fix={"lower": lower}, **options)
 
 
-class Nearest(Wrapped):
+class NearestLowerBody(WrappedModel):
     """A model that draws `MANY` times as many futures and keeps those with the lower body nearest to the first one's.
 
     GSPS selects DLow's futures with a fixed lower body in the same way: the nearest 50 of 1,000.
@@ -336,26 +341,26 @@ class Nearest(Wrapped):
         self.lower = lower
 
     def forecast(self, past: Any, horizon: int, samples: int, **options: Any) -> Any:
-        """Futures, by the squared distance over all frames."""
+        """Return the futures with the smallest squared distance over all frames."""
         candidates = self.model.forecast(past, horizon, self.MANY * samples, **options)["x"]
         lower = candidates[..., self.lower]
         nearest = (lower - lower[0]).square().sum((2, 3)).topk(samples, 0, largest=False).indices
         return {"x": candidates.take_along_dim(nearest[..., None, None], 0)}
 
 
-def places(windows: Any) -> dict[str, list[int]]:
-    """Coordinates of the parts of the body."""
+def coordinates_of_parts(windows: Any) -> dict[str, list[int]]:
+    """Return the indices of the coordinates of each body part."""
     parts = body_parts(windows.skeleton, tuple(UNIONS))
     return {part: [3 * joint + axis for joint in joints for axis in range(3)] for part, joints in parts.items()}
 
 
 def diversities(windows: Any) -> list[Measure]:
-    """The diversity of futures, and of the coordinates of each part of the body alone."""
+    """Return the diversity of whole futures and of each body part."""
 
     def of(place: Any) -> Any:
         return lambda forecasts, *_: average_pairwise_distance(forecasts[..., place])
 
-    selections = {"APD": slice(None)} | {f"APD {part}": place for part, place in places(windows).items()}
+    selections = {"APD": slice(None)} | {f"APD {part}": place for part, place in coordinates_of_parts(windows).items()}
     return [Measure(name, of(place), "m", "higher") for name, place in selections.items()]
 
 
@@ -363,7 +368,7 @@ REFERENCES = "references"
 
 
 def archive(stored: Path, name: str) -> Archive:
-    """The scores of a set."""
+    """Return the archive of the scores of a set."""
     return Archive(stored / f"{name}.zip")
 
 
@@ -384,7 +389,7 @@ def entries(stored: Path, name: str, view: View, methods: Iterable[str]) -> dict
         if members := fnmatch.filter(names, view.member(f"{folder(row)}-seed*")):
             runs = store.read(members)
             basis = basis or runs[0]["basis"]
-            if any(alike(each["basis"]) != alike(basis) for each in runs):
+            if any(comparable_basis(each["basis"]) != comparable_basis(basis) for each in runs):
                 raise ValueError(
                     f"scores of {row} in {store.file} differ from the others in windows, samples, seed or metric models"
                 )
@@ -399,15 +404,15 @@ def rows_of(stored: Path, name: str, view: View) -> dict[str, Row]:
 
 
 EMISSION = 3
-"""In a basis, whether forecasts were means or draws."""
+"""Position in a basis of the kind of forecasts: means or draws."""
 
 
-def alike(basis: Sequence[Any]) -> list[Any]:
-    """What rows of a table must share: all but whether a model's distribution has a mean to forecast."""
+def comparable_basis(basis: Sequence[Any]) -> list[Any]:
+    """Return the entries of a basis that the rows of a table must share: all except the kind of forecasts."""
     return [*basis[:EMISSION], *basis[EMISSION + 1 :]]
 
 
-def titled(name: str, entry: Row) -> str:
+def row_label(name: str, entry: Row) -> str:
     """Return the label of a row, with the options that distinguish it."""
     first = entry.runs[0]
     modes = first["config"].get("method", {}).get("modes")
@@ -418,18 +423,18 @@ def titled(name: str, entry: Row) -> str:
 TRAINED = ("seeds", "CPU minutes")
 
 
-def trained(entry: Row) -> tuple[str, str]:
-    """How many seeds were trained, and how long each took of those that were trained on a processor."""
+def training_cells(entry: Row) -> tuple[str, str]:
+    """Return the number of seeds and the mean minutes of the fits on a CPU."""
     if not entry.trained:
         return "–", "–"
     here = [run["minutes"] for run in entry.runs if run["config"]["training"]["accelerator"] != "cuda"]
     return str(len(entry.runs)), f"{statistics.fmean(here):.1f}" if here else "GPU"
 
 
-def ranked(rows: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
-    """The energy score of all but the truth, the best first."""
-    scores = {name: entry.crossed(RANKED) for name, entry in rows.items() if name != "real motion"}
-    complete = {name: score for name, score in scores.items() if score is not None}  # all motion has it
+def rank_by_energy(rows: Mapping[str, Row]) -> dict[str, TwoWayErrors]:
+    """Return the energy scores of all rows except real motion, best first."""
+    scores = {name: entry.two_way_errors(RANKED) for name, entry in rows.items() if name != "real motion"}
+    complete = {name: score for name, score in scores.items() if score is not None}  # every motion method has the score
     return dict(sorted(complete.items(), key=lambda item: item[1].mean))
 
 
@@ -438,14 +443,14 @@ def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> Table:
 
     The note is the model confidence set.
     """
-    scores = ranked(rows)
+    scores = rank_by_energy(rows)
     header = ["", *TRAINED, f"{RANKED} minus neighbours'", "minus the one above", *columns]
     lines = []
     for name, above in zip(scores, [None, *scores], strict=False):
         row = rows[name]
         minus = [None if name == NEIGHBOURS else NEIGHBOURS, above]
         behind = [None if other is None else scores[name].estimate(scores[other]) for other in minus]
-        lines.append([titled(name, row), *trained(row), *map(cell, [*behind, *map(row.estimate, columns)])])
+        lines.append([row_label(name, row), *training_cells(row), *map(cell, [*behind, *map(row.estimate, columns)])])
     tested = {name: score for name, score in scores.items() if score.count >= ENOUGH}
     if not any(rows[name].trained for name in tested):
         return Table(header, lines)
@@ -454,9 +459,9 @@ def ranking(rows: Mapping[str, Row], columns: Sequence[str]) -> Table:
 
 
 @styled
-def drawn(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
-    """How far above the neighbours' the energy scores of each set are; rows of all in the first one's order."""
-    ranks = {name: ranked(found) for name, found in sets.items()}
+def draw_ranking(sets: Mapping[str, Mapping[str, Row]]) -> Figure:
+    """Draw the energy scores minus the neighbours' for each set; all panels use the row order of the first."""
+    ranks = {name: rank_by_energy(rows_of_set) for name, rows_of_set in sets.items()}
     order = list(dict.fromkeys(row for scores in ranks.values() for row in scores if row != NEIGHBOURS))
     columns = min(2, len(sets))
     rows = math.ceil(len(sets) / columns)
@@ -500,7 +505,7 @@ def main(
         seeds: seeds of each method.
         samples: number of futures of each window.
         scores: folder of scores and metric models; an empty folder starts from the beginning.
-        accelerator: on which to train and to forecast; runs on a GPU record no minutes.
+        accelerator: device for training and forecasts; runs on a GPU record no minutes.
         results: folder of the tables, such as benchmarks/results; None prints them.
         picture: figure of all sets without given paths; drawn only with results.
     """
@@ -509,17 +514,29 @@ def main(
     for name in sets:
         selected = SETS[name]
         if data is not None:
-            named = {row: options for row, options in selected.methods.items() if not methods or row in methods}
-            work(data, runs, scores, name, named, dict.fromkeys(named, selected.views), seeds, samples, accelerator)
+            selected_methods = {
+                row: options for row, options in selected.methods.items() if not methods or row in methods
+            }
+            work(
+                data,
+                runs,
+                scores,
+                name,
+                selected_methods,
+                dict.fromkeys(selected_methods, selected.views),
+                seeds,
+                samples,
+                accelerator,
+            )
         for view in selected.views:
             if rows := rows_of(scores, name, view):
-                made = ranking(rows, [*COLUMNS, *(JUDGED if selected.metric_models else ())])
-                given = "" if view.given is None else f"-{view.given}-given"
-                write(results, {f"index/{name}{given}": made})
+                table = ranking(rows, [*COLUMNS, *(METRIC_MODEL_COLUMNS if selected.metric_models else ())])
+                suffix = "" if view.given is None else f"-{view.given}-given"
+                write(results, {f"index/{name}{suffix}": table})
     sought = {name: rows_of(scores, name, View()) for name, selected in SETS.items() if View() in selected.views}
     futures = {name: rows for name, rows in sought.items() if rows}
     if results is not None and futures:
-        drawn(futures).savefig(picture, dpi=200)
+        draw_ranking(futures).savefig(picture, dpi=200)
 
 
 if __name__ == "__main__":

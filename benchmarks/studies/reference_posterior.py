@@ -17,16 +17,16 @@ from . import bounds
 from .results import Table, write
 
 LENGTH = 6
-"""Steps of the sequences that neural models are fitted to."""
+"""Length of the training sequences of neural models."""
 GUIDES = {name: bounds.GUIDES[name] for name in ("exact", "mean-field", "filtering")}
 
 
 def root_mean_square(values: np.ndarray) -> float:
-    """Of all numbers that are there."""
+    """Return the root mean square of all values except NaN."""
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def said(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
+def diagnostic_cells(model: dvae.DynamicalVAE, x: torch.Tensor, **nuts: int) -> list[str]:
     """Return the cells of both diagnostics of a guide."""
     posterior = dvae.reference_posterior(model, x, progress=False, **nuts)
     tested = dvae.stein_discrepancy(model, x, progress=False)
@@ -49,7 +49,7 @@ COLUMNS = ["bias (rms)", "deviation ratio", "correlations", "the guide’s", "de
 
 
 def normal(oracle: dvae.Oracle, wrong: str) -> Callable[..., None]:
-    """The posterior as a guide: right, or without correlations, or with z_T too narrow by a third given all else."""
+    """Return the posterior as a guide: exact, uncorrelated, or with z_T given the rest too narrow by a third."""
 
     def guide(batch: Any) -> None:
         mean, covariance = oracle.posterior(batch)
@@ -80,7 +80,7 @@ def power(steps: int, sequences: int) -> list[str]:
 
 
 def neural(inference: str, x: torch.Tensor, fitting: int) -> dvae.DynamicalVAE:
-    """A small model that was fitted to sequences."""
+    """Fit a small model to sequences."""
     torch.manual_seed(0)
     model = dvae.DynamicalVAE(bounds.MODEL, inference, {"z": 2, "x": 4}, dvae.networks.Recurrent(16))
     dvae.fit(model, dvae.ArrayWindows(x, observed=LENGTH - 1), steps=fitting, progress=False)
@@ -99,16 +99,16 @@ def main(
 
     Args:
         results: folder of the tables, such as benchmarks/results; None prints them.
-        steps: of a sequence of the surrogate.
-        sequences: of the first table.
-        powers: sequences of the table of power.
-        fitting: steps of the neural models.
-        draws: of each chain of NUTS, and the warm-up's.
+        steps: length of the sequences of the surrogate.
+        sequences: number of sequences in the first table.
+        powers: number of sequences in the table of power.
+        fitting: number of training steps of the neural models.
+        draws: number of draws and of warm-up steps of each NUTS chain.
     """
     rows = []
     for name, text in GUIDES.items():
-        model, _ = bounds.fitted(text, steps, 300, scale=0.9)
-        rows.append([f"`{text}`, {name}", *said(model, model.sample(sequences, steps)["x"])])
+        model, _ = bounds.fit_best_guide(text, steps, 300, scale=0.9)
+        rows.append([f"`{text}`, {name}", *diagnostic_cells(model, model.sample(sequences, steps)["x"])])
     write(results, {"criticism/reference": Table(["best guide", *COLUMNS], rows)})
     guides = ["the posterior, 500 draws", "mean-field, 100 draws", "500 draws", "z_T too narrow, 500 draws"]
     head = ["T", *guides, f"{powers} of these together (p)"]
@@ -122,7 +122,7 @@ def main(
     for name in ("exact", "mean-field"):
         model = neural(GUIDES[name], x[:320], fitting)
         start = process_time()
-        cells = said(model, x[320:322], draws=draws, warmup=draws)
+        cells = diagnostic_cells(model, x[320:322], draws=draws, warmup=draws)
         elapsed = process_time() - start
         bound = dvae.SequenceELBO(num_particles=20).terms(model, x[320:]).bound
         bound_text = f"{bound.mean():.2f} ± {bound.std() / len(bound) ** 0.5:.2f}"

@@ -40,7 +40,7 @@ def tabled(
 
 
 def ordered(rows: Mapping[str, Any], key: Callable[[Any], float]) -> dict[str, Any]:
-    """Rows in the order of a number of theirs, the least first."""
+    """Sort rows by a key, smallest first."""
     return dict(sorted(rows.items(), key=lambda item: key(item[1])))
 
 
@@ -60,7 +60,7 @@ def write(folder: Path | None, tables: Mapping[str, Table]) -> None:
 
 
 def read(name: str, folder: Path = RESULTS) -> Table:
-    """Read a table that was written."""
+    """Read a table and its note."""
     file = folder / f"{name}.csv"
     with file.open(encoding="utf-8", newline="") as lines:
         header, *rows = csv.reader(lines)
@@ -69,7 +69,7 @@ def read(name: str, folder: Path = RESULTS) -> Table:
 
 
 def refuse_unknown(what: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Ends the script where something is asked for that is not there."""
+    """End the script if a name is unknown."""
     known = [*known]
     for name in names:
         if name not in known:
@@ -80,7 +80,7 @@ def require_gpu(option: str) -> None:
     """End the script if an option asks for a GPU and torch finds none."""
     if not torch.cuda.is_available():
         built = "" if torch.version.cuda else ", as it is built without CUDA"
-        sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or take a machine with one")
+        sys.exit(f"torch {torch.__version__} finds no GPU{built}; leave the {option} out, or use a machine with a GPU")
 
 
 def loaded(run: Path) -> Any:
@@ -93,5 +93,5 @@ def loaded(run: Path) -> Any:
 
 def same(evaluation: dvae.Evaluation) -> tuple[object, ...]:
     """Return the settings that evaluations must share to be compared in one table."""
-    drawn = evaluation.samples, evaluation.seed, evaluation.emission, evaluation.bound_particles
-    return evaluation.data, *drawn, evaluation.basis
+    settings = evaluation.samples, evaluation.seed, evaluation.emission, evaluation.bound_particles
+    return evaluation.data, *settings, evaluation.basis

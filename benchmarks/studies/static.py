@@ -31,35 +31,35 @@ from .results import Table, loaded, write
 
 DRAWS, PENALTY, CHUNK = 8, 1e-3, 128
 ONE_BODY = 0.01
-"""Relative spread of bones' lengths over windows below which there is nothing to tell."""
+"""Relative spread of bone lengths below which all windows have one body."""
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def posterior_means(model: Any, batch: Mapping[str, Any], seed: int) -> dict[str, Tensor]:
-    """Means of the guide's draws, (N, D) of a static latent and (N, T, D) of a local one."""
-    found: dict[str, list[Tensor]] = {}
+    """Return means of the guide's draws: (N, D) for a static latent, (N, T, D) for a local one."""
+    means: dict[str, list[Tensor]] = {}
     with seeded_evaluation(model, seed):
         for start in range(0, len(batch["x"]), CHUNK):
             data = on_device_of(model, model.read(rows(batch, slice(start, start + CHUNK))))
-            drawn = [model.guide(data) for _ in range(DRAWS)]
+            draws = [model.guide(data) for _ in range(DRAWS)]
             for name in model.latents:
-                found.setdefault(name, []).append(torch.stack([each[name] for each in drawn]).mean(0).cpu())
-    return {name: torch.cat(values) for name, values in found.items()}
+                means.setdefault(name, []).append(torch.stack([each[name] for each in draws]).mean(0).cpu())
+    return {name: torch.cat(values) for name, values in means.items()}
 
 
 def halves(labels: Sequence[str], places: Tensor) -> Tensor:
-    """(N,) True at windows of every other clip of each label, which a probe is fitted to."""
+    """Return a mask (N,) of the windows of every other clip of each label, to fit probes."""
     counts: dict[str, int] = {}
-    fitted: dict[int, bool] = {}
+    in_first_half: dict[int, bool] = {}
     for label, place in zip(labels, places.tolist(), strict=True):
-        if place not in fitted:
-            fitted[place] = counts.setdefault(label, 0) % 2 == 0
+        if place not in in_first_half:
+            in_first_half[place] = counts.setdefault(label, 0) % 2 == 0
             counts[label] += 1
-    return torch.tensor([fitted[place] for place in places.tolist()])
+    return torch.tensor([in_first_half[place] for place in places.tolist()])
 
 
 def read_label(features: Tensor, labels: Sequence[str], fitted: Tensor) -> Tensor:
-    """Whether a logistic probe of features (N, F) is right, of the windows it was not fitted to."""
+    """Return whether a logistic probe of features (N, F) is right, for each window outside its fit."""
     names = sorted({*labels})
     truth = torch.tensor([names.index(label) for label in labels])
     x = standardised(features, fitted)
@@ -78,13 +78,13 @@ def read_label(features: Tensor, labels: Sequence[str], fitted: Tensor) -> Tenso
 
 
 def read_lengths(features: Tensor, lengths: Tensor, fitted: Tensor) -> float:
-    """Share of the variance of lengths (N, B) that a ridge probe tells, of the windows it was not fitted to."""
+    """Return the R² of a ridge probe of lengths (N, B), over the windows outside its fit."""
     x = standardised(features, fitted)
     mean = lengths[fitted].mean(0)
     gram = x[fitted].mT @ x[fitted] + PENALTY * len(x) * torch.eye(x.shape[1], dtype=x.dtype)
     weights = torch.linalg.solve(gram, x[fitted].mT @ (lengths[fitted] - mean))
-    left = (lengths - mean - x @ weights)[~fitted].square().sum()
-    return float(1 - left / (lengths - lengths[~fitted].mean(0))[~fitted].square().sum())
+    residual = (lengths - mean - x @ weights)[~fitted].square().sum()
+    return float(1 - residual / (lengths - lengths[~fitted].mean(0))[~fitted].square().sum())
 
 
 def standardised(features: Tensor, fitted: Tensor) -> Tensor:
@@ -95,20 +95,20 @@ def standardised(features: Tensor, fitted: Tensor) -> Tensor:
 
 
 def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> list[list[str]]:
-    """For each thing to read, and for each label: the share of windows told rightly; then the bones."""
+    """Return a row for each feature: the accuracy of probes by label, then the R² of bone lengths."""
     batch = windows.all()
     inferred, x = posterior_means(model, batch, seed), batch["x"]
     features = {name: value if value.dim() == 2 else value.mean(1) for name, value in inferred.items()}
     features["mean and spread of poses"] = torch.cat([x.mean(1), x.std(1)], 1)
     places = clip_index(windows.keys)
     lengths = windows.skeleton.bone_lengths(windows.positions(x)).mean(1).double()
-    told = {label: windows.labels(label) for label in labels}
+    values_by_label = {label: windows.labels(label) for label in labels}
     lines = []
     for name, values in features.items():
         cells = []
         for label in labels:
-            fitted = halves(told[label], places)
-            cells.append(share(read_label(values, told[label], fitted), places[~fitted]))
+            fitted = halves(values_by_label[label], places)
+            cells.append(format_accuracy(read_label(values, values_by_label[label], fitted), places[~fitted]))
         varied = float((lengths.std(0) / lengths.mean(0)).mean())
         fitted = halves([""] * len(x), places)
         cells.append(f"{read_lengths(values, lengths, fitted):.2f}" if varied > ONE_BODY else "–")
@@ -116,36 +116,38 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
     return lines
 
 
-def share(right: Tensor, places: Tensor) -> str:
-    """A mean over windows with its standard error, clustered by clip."""
+def format_accuracy(right: Tensor, places: Tensor) -> str:
+    """Format the mean over windows with its standard error, clustered by clip."""
     _, clips = np.unique(places.numpy(), return_inverse=True)
-    found = TwoWayErrors.by_clip(right.numpy()[None], np.ones(len(clips)), clips).estimate()
-    return f"{found.mean:.3f} ± {found.sequences:.3f}"
+    estimate = TwoWayErrors.by_clip(right.numpy()[None], np.ones(len(clips)), clips).estimate()
+    return f"{estimate.mean:.3f} ± {estimate.sequences:.3f}"
 
 
 def swaps(model: Any, windows: Windows, label: str, count: int, seed: int) -> list[list[str]]:
-    """By latent and share of the way to another's: how far the mean pose and the motion about it have gone, in mm."""
-    batch, named = windows.all(), np.array(windows.labels(label))
+    """Return a row for each latent and amount of interpolation: changes of the mean pose and of the motion, in mm."""
+    batch, label_values = windows.all(), np.array(windows.labels(label))
     draw = np.random.default_rng(seed)
-    first = draw.permutation(len(named))[:count]
-    second = np.array([draw.choice(np.flatnonzero(named != named[place])) for place in first])
-    ours, theirs = (rows(batch, torch.from_numpy(places)) for places in (first, second))
-    goal = windows.positions(theirs["x"]).mean(1)
+    first = draw.permutation(len(label_values))[:count]
+    second = np.array([draw.choice(np.flatnonzero(label_values != label_values[place])) for place in first])
+    first_batch, second_batch = (rows(batch, torch.from_numpy(places)) for places in (first, second))
+    goal = windows.positions(second_batch["x"]).mean(1)
     lines = []
     with seeded_evaluation(model, seed):
-        own, other = (model.guide(on_device_of(model, model.read(each))) for each in (ours, theirs))
+        first_latents, second_latents = (
+            model.guide(on_device_of(model, model.read(each))) for each in (first_batch, second_batch)
+        )
 
-        def made(latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-            joints = windows.positions(decode(model, ours, {**own, **latents}, True).cpu())
+        def decoded(latents: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+            joints = windows.positions(decode(model, first_batch, {**first_latents, **latents}, True).cpu())
             mean = joints.mean(1)
             return mean, joints - mean[:, None]
 
-        pose, motion = made({})
+        pose, motion = decoded({})
         for latent in model.latents:
-            for amount in SHARES if own[latent].dim() == 2 else (1.0,):
-                mean, about = made({latent: torch.lerp(own[latent], other[latent], amount)})
-                moved = (mean - pose, about - motion, mean - goal)
-                lines.append([latent, f"{amount:g}", *(f"{1000 * each.norm(dim=-1).mean():.0f}" for each in moved)])
+            for amount in SHARES if first_latents[latent].dim() == 2 else (1.0,):
+                mean, deviations = decoded({latent: torch.lerp(first_latents[latent], second_latents[latent], amount)})
+                changes = (mean - pose, deviations - motion, mean - goal)
+                lines.append([latent, f"{amount:g}", *(f"{1000 * each.norm(dim=-1).mean():.0f}" for each in changes)])
     return lines
 
 
@@ -160,25 +162,25 @@ def main(
     """Write the tables.
 
     Args:
-        runs: their directories.
+        runs: run directories.
         results: folder of the tables, such as benchmarks/results; None prints them.
-        labels: what probes are to tell.
-        splits: on whose windows; a probe is fitted on each anew.
-        count: windows that are decoded with a latent of another.
-        seed: of all draws.
+        labels: labels that probes predict.
+        splits: splits of the windows; each has its own probes.
+        count: number of windows to decode with a latent of another window.
+        seed: seed of all draws.
     """
-    told, swapped = [], []
+    probe_rows, swap_rows = [], []
     for path in runs:
         run = loaded(path)
         for split in splits:
             windows = run.data.windows(split)
-            told += [[path.name, split, *line] for line in probes(run.model, windows, labels, seed)]
+            probe_rows += [[path.name, split, *line] for line in probes(run.model, windows, labels, seed)]
         windows = run.data.windows("test")
-        swapped += [[path.name, *line] for line in swaps(run.model, windows, labels[0], count, seed)]
-    read = Table(["", "windows", "probe of", *labels, "bone lengths, R²"], told)
-    moved = ["mean pose moved, mm", "motion about it moved, mm", "mean pose from theirs, mm"]
-    header = ["", "latent", "share of another's", *moved]
-    write(results, {"hit_dvae/probes": read, "hit_dvae/exchanged-latents": Table(header, swapped)})
+        swap_rows += [[path.name, *line] for line in swaps(run.model, windows, labels[0], count, seed)]
+    probe_table = Table(["", "windows", "probe of", *labels, "bone lengths, R²"], probe_rows)
+    columns = ["mean pose moved, mm", "motion about it moved, mm", "mean pose from theirs, mm"]
+    header = ["", "latent", "share of another's", *columns]
+    write(results, {"hit_dvae/probes": probe_table, "hit_dvae/exchanged-latents": Table(header, swap_rows)})
 
 
 if __name__ == "__main__":

@@ -37,26 +37,26 @@ MODELS: dict[str, tuple[str, str, dict[str, int]]] = {
 
 
 def switching(sequences: int, steps: int) -> tuple[Tensor, Tensor]:
-    """Points that go round, slowly or fast, and change from one to the other about every twentieth step.
+    """Simulate points on a circle that switch between a slow and a fast rotation, every 20 steps on average.
 
     Returns:
-        x (N, T, 2), and which of the two (N, T).
+        x (N, T, 2), and the state (N, T): 0 is slow, 1 is fast.
     """
     state = (torch.rand(sequences) < 0.5).long()
-    place, found, states = torch.randn(sequences, 2), [], []
+    place, points, states = torch.randn(sequences, 2), [], []
     for _ in range(steps):
         state = torch.where(torch.rand(sequences) < 0.05, 1 - state, state)
         angle = torch.tensor([0.1, 0.7])[state]
         turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).unflatten(1, (2, 2))
         place = 0.99 * (turn @ place[..., None])[..., 0] + 0.1 * torch.randn(sequences, 2)
-        found.append(place + 0.2 * torch.randn(sequences, 2))
+        points.append(place + 0.2 * torch.randn(sequences, 2))
         states.append(state)
-    return torch.stack(found, 1), torch.stack(states, 1)
+    return torch.stack(points, 1), torch.stack(states, 1)
 
 
 @torch.no_grad()
 def filtered(model: dvae.DynamicalVAE, x: Tensor, particles: int) -> Tensor:
-    """(B,) log of a bootstrap filter's estimate of p(x): states and latents by the model, weighed by the data alone."""
+    """Return the log of a bootstrap particle filter's estimate of p(x), (B,); the model is the proposal."""
     size, steps, _ = x.shape
     names = [name for block in model.generative.blocks for name in block.names if name not in model.observed]
     last: dict[str, Tensor] = {n: torch.zeros(size * particles, model.sizes[n]) for n in (*names, "x")}
@@ -68,8 +68,8 @@ def filtered(model: dvae.DynamicalVAE, x: Tensor, particles: int) -> Tensor:
         now["x"] = x[:, t].repeat_interleave(particles, 0)
         logs = _law(model, "x", last, now, t == 0).log_prob(now["x"]).unflatten(0, (size, particles))
         total += logs.logsumexp(1) - math.log(particles)
-        chosen = torch.multinomial(logs.softmax(1), particles, replacement=True)
-        rows = (chosen + particles * torch.arange(size)[:, None]).flatten()
+        ancestors = torch.multinomial(logs.softmax(1), particles, replacement=True)
+        rows = (ancestors + particles * torch.arange(size)[:, None]).flatten()
         last = {name: value[rows] for name, value in now.items()}
     return total
 
@@ -85,25 +85,27 @@ def _law(
     return conditional.head.joint(tuple(p[:, -1] for p in parameters))
 
 
-def told(model: dvae.DynamicalVAE, x: Tensor, states: Tensor) -> str:
+def state_accuracy(model: dvae.DynamicalVAE, x: Tensor, states: Tensor) -> str:
     """Return the share of steps with the correct state, after naming each state by its most frequent true state."""
     if "k" not in model.summed:
         return "–"
-    found = model.states(x, 8)["k"].mean(0).argmax(-1)
-    counts = torch.einsum("btk,bts->ks", one_hot(found, model.sizes["k"]).float(), one_hot(states, 2).float())
+    inferred = model.states(x, 8)["k"].mean(0).argmax(-1)
+    counts = torch.einsum("btk,bts->ks", one_hot(inferred, model.sizes["k"]).float(), one_hot(states, 2).float())
     return f"{counts.amax(1).sum() / counts.sum():.2f}"
 
 
 def row(
     name: str, train: Tensor, test: tuple[Tensor, Tensor], fitting: int, particles: int, filtering: int
 ) -> list[str]:
-    """A model's line."""
+    """Fit a model and return its row."""
     generative, inference, sizes = MODELS[name]
     torch.manual_seed(0)
     networks = {"p": Dense((32,)), "default": Recurrent(32)}
     model = dvae.DynamicalVAE(generative, inference, {**sizes, "x": 2}, networks)
-    held = len(train) // 8
-    dvae.fit(model, train[held:], train[:held], steps=fitting, batch_size=64, learning_rate=3e-3, progress=False)
+    validation = len(train) // 8
+    dvae.fit(
+        model, train[validation:], train[:validation], steps=fitting, batch_size=64, learning_rate=3e-3, progress=False
+    )
     x, states = test
     per = x.shape[1]
     with torch.no_grad():
@@ -112,7 +114,7 @@ def row(
     few = x[:filtering]
     gap = dvae.iwae_bound(model, few, particles).bound / per - filtered(model, few, 10_000) / per
     cells = [f"{value.mean():.3f} ± {value.std() / len(value) ** 0.5:.3f}" for value in (elbo, weighted, gap)]
-    return [f"{name}, `{generative}`", *cells, told(model, x, states)]
+    return [f"{name}, `{generative}`", *cells, state_accuracy(model, x, states)]
 
 
 def main(
@@ -122,10 +124,10 @@ def main(
 
     Args:
         results: folder of the tables, such as benchmarks/results; None prints them.
-        steps: of a sequence.
-        fitting: steps of training.
-        particles: of the importance-weighted bound.
-        filtering: test sequences that are filtered with 10,000 particles.
+        steps: length of a sequence.
+        fitting: number of training steps.
+        particles: number of particles of the IWAE bound.
+        filtering: number of test sequences for the filter with 10,000 particles.
     """
     torch.manual_seed(1)
     train, _ = switching(1024, steps)

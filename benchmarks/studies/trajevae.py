@@ -26,18 +26,19 @@ METRICS = {
     "bones within 10 %": ".1%",
     "corrected by, m": ".3f",
 }
-"""What is told of motions, and how it is printed."""
+"""Measures of motions, with their formats."""
 
 
-def figures(made: Completion, true: np.ndarray) -> tuple[float, ...]:
-    """Of motions whose bones should have these lengths: means over motions, frames, and joints or bones."""
-    off, bones = np.stack([*made.errors.values()]), np.abs(made.skeleton.bone_lengths(made.positions) / true - 1)
-    moved = np.nan if made.corrections is None else made.corrections.mean()
-    return off.mean(), (off < 0.01).mean(), bones.mean(), (bones < 0.1).mean(), moved
+def measure_completion(completion: Completion, true: np.ndarray) -> tuple[float, ...]:
+    """Return the means of the measures over motions, frames, and joints or bones, given true bone lengths."""
+    off = np.stack([*completion.errors.values()])
+    bones = np.abs(completion.skeleton.bone_lengths(completion.positions) / true - 1)
+    corrected = np.nan if completion.corrections is None else completion.corrections.mean()
+    return off.mean(), (off < 0.01).mean(), bones.mean(), (bones < 0.1).mean(), corrected
 
 
 def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -> Table:
-    """By the number of given joints, and whether motions are to be exact; ± one standard error over clips."""
+    """Return a table by number of given joints, with and without exact paths; ± is one standard error over clips."""
     run = loaded(folder)
     if not isinstance(run.model, TrajectoryModel):
         sys.exit(f"{folder} is a run of {run.method.name}, which follows no paths; give one of trajevae or cvae-rnn")
@@ -46,27 +47,27 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
         [windows.skeleton.find(joint) for joint in joints]
     except ValueError as error:
         sys.exit(str(error))
-    chosen = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
-    motions = windows.positions(windows.all()["x"][chosen]).numpy()
-    _, clips = np.unique(clip_index(windows.keys)[chosen].numpy(), return_inverse=True)
+    indices = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
+    motions = windows.positions(windows.all()["x"][indices]).numpy()
+    _, clips = np.unique(clip_index(windows.keys)[indices].numpy(), return_inverse=True)
     rows = []
     for number, exact in product(range(1, len(joints) + 1), (False, True)):
         torch.manual_seed(0)
-        found = []
-        begun = time.perf_counter()
+        values = []
+        start = time.perf_counter()
         for motion in motions:
             paths = {joint: motion[1:, windows.skeleton.find(joint)] for joint in joints[:number]}
-            made = run.model.complete(motion[0], paths, samples=samples, exact=exact)
-            found.append(figures(made, windows.skeleton.bone_lengths(motion[:1])))
-        spent = (time.perf_counter() - begun) / (len(motions) * samples)
+            completion = run.model.complete(motion[0], paths, samples=samples, exact=exact)
+            values.append(measure_completion(completion, windows.skeleton.bone_lengths(motion[:1])))
+        elapsed = (time.perf_counter() - start) / (len(motions) * samples)
         means = [
-            TwoWayErrors.by_clip(each[None], np.ones(len(motions)), clips).estimate() for each in np.transpose(found)
+            TwoWayErrors.by_clip(each[None], np.ones(len(motions)), clips).estimate() for each in np.transpose(values)
         ]
-        told = [
+        formatted = [
             "–" if np.isnan(mean.mean) else f"{mean.mean:{form}} ± {mean.sequences:{form}}"
             for mean, form in zip(means, METRICS.values(), strict=True)
         ]
-        rows.append([", ".join(joints[:number]), "exact" if exact else "", *told, f"{spent:.2f}"])
+        rows.append([", ".join(joints[:number]), "exact" if exact else "", *formatted, f"{elapsed:.2f}"])
     return Table(["given", "exact", *METRICS, "seconds a motion"], rows)
 
 

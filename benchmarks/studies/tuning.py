@@ -26,8 +26,8 @@ from dvae.motion.data.dataset import MotionData
 from dvae.motion.scoring.energies import pose_prior_energy
 from dvae.runs.directory import load
 
-from .engine import settings, swept
-from .ranking import JOINTS, METRIC_MODELS, SCORES, SETS, entries, fitted_metric_models, judging, parted
+from .engine import settings, sweep_seeds
+from .ranking import JOINTS, METRIC_MODELS, SCORES, SETS, entries, fitted_metric_models, motion_scores, split_options
 from .results import Table, refuse_unknown, tabled, write
 
 TUNING = motion.PROTOCOLS["bandai2-tuning"]
@@ -35,9 +35,9 @@ EVERY, SAMPLES = 4, 50
 REFERENCES = ("zero velocity", "nearest neighbours")
 COLUMNS_OF_METRIC_MODELS = ("log density", "pose NLL", "ACC content")
 COLUMNS = ("ADE", "FDE", "ADEm", "APD", "energy score", "ACC content", "FID content", "pose NLL", "KL w", "KL z")
-"""Scores that tables show, where there are."""
+"""Scores in the tables, if they are available."""
 SEEDS, TESTED = "seeds", ("bandai2-by-style", "bandai2-trajectories")
-"""The table of what another seed does, and the sets whose rows tell it."""
+"""Name of the table of the spread over seeds, and the sets that provide its rows."""
 PATH_COLUMNS = tuple(f"{score}, {count} given" for score in ("ADE", "APD", "energy score") for count in range(5))
 
 
@@ -51,7 +51,7 @@ class Section:
         cases: options by name of the case, including those of `Training`.
         options: options of all cases, unless a case overrides them; later changes of a preset do not apply.
         protocol: window protocol.
-        judged: whether the method uses the pose prior.
+        uses_pose_prior: whether the method uses the pose prior of the metric models.
         seeds: seeds of each case.
     """
 
@@ -60,56 +60,61 @@ class Section:
     cases: Mapping[str, Mapping[str, Any]]
     options: Mapping[str, Any] = field(default_factory=dict)
     protocol: motion.Protocol = TUNING
-    judged: bool = False
+    uses_pose_prior: bool = False
     seeds: tuple[int, ...] = (0,)
 
     @property
     def columns(self) -> Sequence[str]:
-        """Of its table."""
+        """Columns of the section's table."""
         return COLUMNS if self.protocol.root == "drop" else PATH_COLUMNS
 
     def of(self, case: str, prior: Path) -> tuple[Any, Training]:
-        """The method of a case, and its training."""
-        options, told = parted({**self.options, **self.cases[case]})
+        """Return the method and the training of a case."""
+        options, training_options = split_options({**self.options, **self.cases[case]})
         method = options.pop("method", self.method)
-        if (
-            self.judged and options.get("pose_prior") != 0 and options.get("heading", True)
-        ):  # as the metric model has it
+        # the pose prior of the metric models reads poses that are rotated to one heading
+        if self.uses_pose_prior and options.get("pose_prior") != 0 and options.get("heading", True):
             options["pose_prior_run"] = str(prior)
-        return dvae.method(method, **options), replace(self.training, **told)
+        return dvae.method(method, **options), replace(self.training, **training_options)
 
 
 PATHS = replace(motion.PROTOCOLS["bandai2-trajectories"], name="bandai2-paths-tuning", train=("A",), test=("B",))
 
 
-SECTIONS = {
-    name: Section(
-        training=Training(**told.pop("training")), protocol=PATHS if told.pop("paths", False) else TUNING, **told
+def read_section(options: Mapping[str, Any]) -> Section:
+    """Return the section that one table of the TOML file describes."""
+    fields = {name: value for name, value in options.items() if name not in ("training", "paths", "judged")}
+    return Section(
+        training=Training(**options["training"]),
+        protocol=PATHS if options.get("paths", False) else TUNING,
+        uses_pose_prior=options.get("judged", False),
+        **fields,
     )
-    for name, told in settings(__file__).items()
-}
+
+
+SECTIONS = {name: read_section(options) for name, options in settings(__file__).items()}
 
 
 STEPS = {"prior": (500, 1000, 2000, 4000), "content": (750, 1500, 3000, 6000)}
-"""Of metric models, which are to know poses and contents of styles that they have not seen."""
+"""Numbers of training steps of metric models, which must generalise to unseen styles."""
 SEEDS_OF = {"prior": (0, 1, 2), "content": (0,)}
 OF_METRIC_MODELS = [f"{metric_model} {steps} steps" for metric_model, tried in STEPS.items() for steps in tried]
 
 
-Kept = dict[str, dict[str, dict[str, float]]]
+ScoresByCase = dict[str, dict[str, dict[str, float]]]
 """Means of scores, by case and seed."""
 
 
 class Store:
-    """The scores of a section, in a file of JSON that holds all sections."""
+    """Scores of a section; one JSON file contains all sections."""
 
     def __init__(self, file: Path, section: str) -> None:
         self.file, self.section = file, section
-        self.all: dict[str, Kept] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        self.all: dict[str, ScoresByCase] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
     @property
-    def found(self) -> Kept:
-        """By case and seed; none before the first."""
+    def scores(self) -> ScoresByCase:
+        """Scores by case and seed; empty before the first."""
         return self.all.get(self.section, {})
 
     def add(self, case: str, seed: int, scores: Mapping[str, float]) -> None:
@@ -120,20 +125,22 @@ class Store:
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self.file.write_text(json.dumps(self.all, indent=1) + "\n", encoding="utf-8")
 
-    def lacks(self, case: str, seed: int) -> bool:
-        """Whether it has not been scored."""
-        return str(seed) not in self.found.get(case, {})
+    def is_missing(self, case: str, seed: int) -> bool:
+        """Return whether a case has no scores for a seed."""
+        return str(seed) not in self.scores.get(case, {})
 
 
 def of_metric_models(data: MotionData, runs: Path, store: Store) -> None:
-    """Fits metric models for other numbers of steps, and scores real motion of the judging group by each."""
+    """Fit metric models with other numbers of steps, and score real motion of group B with each."""
     for row in OF_METRIC_MODELS:
         name, steps, _ = row.split()
         method, options, training = METRIC_MODELS[name]
-        for seed in [seed for seed in SEEDS_OF[name] if store.lacks(row, seed)]:
-            told = replace(training, steps=int(steps))
-            (path,) = swept(row, registry.metric_models()[method](**options), data, runs, (seed,), told)
-            store.add(row, seed, of_metric_model(name, path, seen(data)))
+        for seed in [seed for seed in SEEDS_OF[name] if store.is_missing(row, seed)]:
+            training_options = replace(training, steps=int(steps))
+            (path,) = sweep_seeds(
+                row, registry.metric_models()[method](**options), data, runs, (seed,), training_options
+            )
+            store.add(row, seed, of_metric_model(name, path, selection_windows(data)))
 
 
 def of_metric_model(name: str, run: Path, windows: motion.Windows) -> dict[str, float]:
@@ -144,51 +151,57 @@ def of_metric_model(name: str, run: Path, windows: motion.Windows) -> dict[str, 
         with torch.no_grad():
             energy = pose_prior_energy(poses[None], prior, prior.skeleton).mean()
             return {"log density": prior.log_prob(poses).mean().item(), "pose NLL": energy.item()}
-    found = dvae.evaluate(
-        {}, windows, scores=judging({name: run}), samples=1, references=["zero velocity"], progress=False
+    evaluation = dvae.evaluate(
+        {}, windows, scores=motion_scores({name: run}), samples=1, references=["zero velocity"], progress=False
     )
-    return {f"ACC {name}": found["real motion"][f"ACC {name}"].mean}
+    return {f"ACC {name}": evaluation["real motion"][f"ACC {name}"].mean}
 
 
-def of_references(data: MotionData, store: Store, judged: Mapping[str, Path]) -> None:
+def of_references(data: MotionData, store: Store, metric_models: Mapping[str, Path]) -> None:
     """Score the missing references, which use no given paths."""
     drop, name = data.protocol.root == "drop", data.protocol.name
-    rows = [row for row in REFERENCES if store.lacks(f"{name}: {row}", 0)]
+    rows = [row for row in REFERENCES if store.is_missing(f"{name}: {row}", 0)]
     if not rows:
         return
     train = motion.windows(data.motion, data.protocol, "train+validation")
-    options = {"scores": judging(judged) if drop else motion.scores, "references": rows, "training_windows": train}
-    found = dvae.evaluate({}, seen(data), samples=SAMPLES, progress=False, **options)
+    options = {
+        "scores": motion_scores(metric_models) if drop else motion.scores,
+        "references": rows,
+        "training_windows": train,
+    }
+    evaluation = dvae.evaluate({}, selection_windows(data), samples=SAMPLES, progress=False, **options)
     for row in rows:
-        means = {score: each.mean for score, each in found[row].items()}
+        means = {score: each.mean for score, each in evaluation[row].items()}
         ways = [""] if drop else [f", {count} given" for count in range(len(JOINTS) + 1)]
         store.add(f"{name}: {row}", 0, {f"{score}{way}": mean for score, mean in means.items() for way in ways})
 
 
-def seen(data: MotionData) -> motion.Windows:
-    """Every fourth window of each clip of the judging group, the first one among them."""
+def selection_windows(data: MotionData) -> motion.Windows:
+    """Return every fourth test window of each clip of group B, including the first."""
     protocol = replace(data.protocol, test_stride=EVERY * data.protocol.test_stride)
     return motion.windows(data.motion, protocol, "test")
 
 
-def score(path: Path, data: MotionData, judged: Mapping[str, Path]) -> dict[str, float]:
-    """Means over these windows."""
-    model, windows, found = load(path).model, seen(data), {}
+def score(path: Path, data: MotionData, metric_models: Mapping[str, Path]) -> dict[str, float]:
+    """Return the mean scores of a run on the selection windows."""
+    model, windows, means = load(path).model, selection_windows(data), {}
     if data.protocol.root == "drop":
-        return evaluated(model, windows, judging(judged))
+        return mean_scores(model, windows, motion_scores(metric_models))
     for count in range(len(JOINTS) + 1):
-        one = evaluated(model, windows.given(JOINTS[:count]), motion.scores)
-        found |= {f"{name}, {count} given": value for name, value in one.items()}
-    return found
+        one = mean_scores(model, windows.given(JOINTS[:count]), motion.scores)
+        means |= {f"{name}, {count} given": value for name, value in one.items()}
+    return means
 
 
-def evaluated(model: Any, windows: Any, scores: Any, **told: Any) -> dict[str, float]:
-    """Means of scores over windows; the last arguments are of `dvae.evaluate`."""
-    found = dvae.evaluate(model, windows, scores=scores, samples=SAMPLES, references=False, progress=False, **told)
-    return {name: each.mean for name, each in found["model"].items()}
+def mean_scores(model: Any, windows: Any, scores: Any, **options: Any) -> dict[str, float]:
+    """Return mean scores over windows; further options are arguments of `dvae.evaluate`."""
+    evaluation = dvae.evaluate(
+        model, windows, scores=scores, samples=SAMPLES, references=False, progress=False, **options
+    )
+    return {name: each.mean for name, each in evaluation["model"].items()}
 
 
-def shown(name: str, scores: Sequence[Mapping[str, float]]) -> str:
+def score_cell(name: str, scores: Sequence[Mapping[str, float]]) -> str:
     """Return the mean over seeds, followed by the value of each seed if there are several."""
     values = [each.get(name, nan) for each in scores]
     if any(map(isnan, values)):
@@ -198,15 +211,16 @@ def shown(name: str, scores: Sequence[Mapping[str, float]]) -> str:
 
 
 def spread() -> Table:
-    """What another seed does to the energy score of methods with the steps of their presets, by their test windows.
+    """Return a table of the deviation over seeds of the energy score on test windows, with the presets' steps.
 
-    With paths to its mean over none to four. A difference of two runs has a standard deviation of sqrt(2) as much.
+    For methods with paths, scores are means over zero to four paths. A difference of two runs has sqrt(2) times the
+    standard deviation.
     """
     lines = []
     for name in TESTED:
         views = [entries(SCORES, name, view, SETS[name].methods) for view in SETS[name].views]
         for row in SETS[name].methods:
-            seeds = [found[row].by_seed("energy score") for found in views if row in found]
+            seeds = [rows[row].by_seed("energy score") for rows in views if row in rows]
             if (count := min(map(len, seeds), default=0)) > 1:
                 deviation = np.mean([means[:count] for means in seeds], 0).std(ddof=1)
                 lines.append([row, str(count), f"{deviation:.3f}", f"{2 * sqrt(2) * deviation:.2f}"])
@@ -215,24 +229,25 @@ def spread() -> Table:
 
 def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
     """Fit and score missing results."""
-    opened = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
-    asked = [SECTIONS[name].protocol for name in sections if name != "metric_models"]
-    judged = fitted_metric_models(opened[TUNING.name], runs) if any(each.root == "drop" for each in asked) else {}
-    prior = judged.get("prior", Path()).absolute()
+    datasets = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
+    protocols = [SECTIONS[name].protocol for name in sections if name != "metric_models"]
+    needs_metric_models = any(each.root == "drop" for each in protocols)
+    metric_models = fitted_metric_models(datasets[TUNING.name], runs) if needs_metric_models else {}
+    prior = metric_models.get("prior", Path()).absolute()
     for name in sections:
         store = Store(stored, name)
         if name == "metric_models":
-            of_metric_models(opened[TUNING.name], runs / name, store)
+            of_metric_models(datasets[TUNING.name], runs / name, store)
             continue
         section = SECTIONS[name]
-        own = opened[section.protocol.name]
-        of_references(own, Store(stored, "references"), judged)
+        data_set = datasets[section.protocol.name]
+        of_references(data_set, Store(stored, "references"), metric_models)
         for case in section.cases:
-            if seeds := [seed for seed in section.seeds if store.lacks(case, seed)]:
+            if seeds := [seed for seed in section.seeds if store.is_missing(case, seed)]:
                 method, training = section.of(case, prior)
-                paths = swept(case, method, own, runs / name, seeds, training, jobs)
+                paths = sweep_seeds(case, method, data_set, runs / name, seeds, training, jobs)
                 for seed, path in zip(seeds, paths, strict=True):
-                    store.add(case, seed, score(path, own, judged))
+                    store.add(case, seed, score(path, data_set, metric_models))
 
 
 def main(
@@ -254,25 +269,27 @@ def main(
         results: folder of the tables, such as benchmarks/results; None prints them.
     """
     refuse_unknown("section", sections, ("metric_models", SEEDS, *SECTIONS))
-    tried = [name for name in sections if name != SEEDS]
+    names = [name for name in sections if name != SEEDS]
     if data is not None:
-        work(data, runs, stored, tried, jobs)
+        work(data, runs, stored, names, jobs)
     if SEEDS in sections:
         write(results, {"tuning/seeds": spread()})
-    known = Store(stored, "references").found
-    for name in tried:
-        columns, cases, beside = COLUMNS_OF_METRIC_MODELS, OF_METRIC_MODELS, {}
+    references = Store(stored, "references").scores
+    for name in names:
+        columns, cases, reference_rows = COLUMNS_OF_METRIC_MODELS, OF_METRIC_MODELS, {}
         if name != "metric_models":
             section = SECTIONS[name]
             columns, cases = section.columns, [*section.cases]
-            beside = {row: known.get(f"{section.protocol.name}: {row}") for row in REFERENCES}
-        found = Store(stored, name).found
-        scored = {
-            row: [*seeds.values()] for row, seeds in {**beside, **{c: found.get(c) for c in cases}}.items() if seeds
+            reference_rows = {row: references.get(f"{section.protocol.name}: {row}") for row in REFERENCES}
+        stored_scores = Store(stored, name).scores
+        rows = {
+            row: [*seeds.values()]
+            for row, seeds in {**reference_rows, **{c: stored_scores.get(c) for c in cases}}.items()
+            if seeds
         }
         head = name.replace("_", " ")
-        made = tabled(scored, {column: partial(shown, column) for column in columns}, head)
-        write(results, {f"tuning/{name}": made})
+        table = tabled(rows, {column: partial(score_cell, column) for column in columns}, head)
+        write(results, {f"tuning/{name}": table})
 
 
 if __name__ == "__main__":

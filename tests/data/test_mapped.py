@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dvae
-from benchmarks.speed import Held
+from benchmarks.speed import TensorMemory
 from dvae import motion
 from dvae.cli import main
 from dvae.cli.tables import is_table
@@ -213,9 +213,9 @@ def peak_memory(action, path):
     """Return the peak bytes of arrays and tensors during an action on a file."""
     tracemalloc.start()
     try:
-        with Held() as tensors:
+        with TensorMemory() as tensors:
             action(path)
-        return tracemalloc.get_traced_memory()[1] + tensors.most
+        return tracemalloc.get_traced_memory()[1] + tensors.peak
     finally:
         tracemalloc.stop()
 

@@ -76,4 +76,4 @@ def test_bounds_are_per_step_with_standard_errors_over_sequences(out, tmp_path):
     rows = engine.read(tmp_path / "tiny", [domains.BASELINE], "validation.json")[domains.BASELINE]
     assert rows.of("bounds").estimate(domains.BOUND) == expected
     assert expected.mean == pytest.approx((bounds * steps).sum() / 62)
-    assert domains.said(rows, "bounds", domains.BOUND) == str(expected)
+    assert domains.score_cell(rows, "bounds", domains.BOUND) == str(expected)

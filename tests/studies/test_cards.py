@@ -1,16 +1,16 @@
-"""Tables of the pages of results, which come from CSV files."""
+"""Tables of the pages of results agree with the CSV files."""
 
 import pytest
 
 from benchmarks.studies import cards
 from benchmarks.studies.results import DOCS
 
-PAGES = sorted(page for page in (DOCS / "results").glob("*.md") if page.stem != "appendix")  # which is generated
+PAGES = sorted(page for page in (DOCS / "results").glob("*.md") if page.stem != "appendix")  # a generated page
 WORDS = {"index": 800, "speed": 400}
 
 
 @pytest.mark.parametrize(
-    ("cells", "shown"),
+    ("cells", "printed"),
     [
         (["0.240 ± 0.003 ± 0.004", "0.5 ± 0.26"], ["0.2 ± 0.0", "0.5 ± 0.3"]),
         (["-.28 ± .12", "0"], ["-.28 ± 0.12", "0"]),
@@ -19,12 +19,12 @@ WORDS = {"index": 800, "speed": 400}
         (["1,834", "z 0.20, 3", "at most 1.2"], ["1,834", "z 0.20, 3", "at most 1.2"]),
     ],
 )
-def test_cells_have_the_total_error_and_the_same_decimals(cells, shown):
-    assert cards.aligned(cells) == shown
+def test_cells_have_the_total_error_and_the_same_decimals(cells, printed):
+    assert cards.aligned(cells) == printed
 
 
 def test_a_card_has_the_named_rows_and_columns():
-    """A row is named by its first cells, a column by its name without an arrow."""
+    """The first cells name a row; a column is named without ↓ or ↑."""
     rows = {"two paths": ["trajevae", "2"], "neighbours": "nearest neighbours"}
     columns = {"ADE (m) ↓": "ADE", "KL": ["family/teacher-forced", "ELBO"]}
     with pytest.raises(ValueError, match="no source has the column KL"):
@@ -42,8 +42,8 @@ def test_a_card_has_the_named_rows_and_columns():
 
 
 @pytest.mark.parametrize("page", cards.CARDS)
-def test_tables_of_a_page_are_those_of_the_files(page):
-    assert cards.filled(page, cards.CARDS[page]) == (DOCS / "results" / f"{page}.md").read_text(encoding="utf-8")
+def test_tables_of_a_page_agree_with_the_files(page):
+    assert cards.fill_page(page, cards.CARDS[page]) == (DOCS / "results" / f"{page}.md").read_text(encoding="utf-8")
     assert all(len(table["columns"]) <= 5 for table in cards.CARDS[page].values())
 
 

@@ -1,4 +1,4 @@
-"""What studies share: rows of seeds, measurements that are made once, and archives of them."""
+"""Shared code of studies: rows over seeds, stored measurements, and archives."""
 
 import numpy as np
 import pytest
@@ -13,15 +13,15 @@ def row(*values, clips="aab", weights=(1, 3, 2), **options):
 
 
 def test_sequences_count_by_their_weights_and_errors_are_over_clips():
-    found = row([1.0, 5.0, 2.0], [2.0, 6.0, 4.0]).estimate("ADE")
-    assert found == TwoWayErrors.of(np.array([[4.0, 2.0], [5.0, 4.0]]), np.array([4.0, 2.0])).estimate()
+    estimate = row([1.0, 5.0, 2.0], [2.0, 6.0, 4.0]).estimate("ADE")
+    assert estimate == TwoWayErrors.of(np.array([[4.0, 2.0], [5.0, 4.0]]), np.array([4.0, 2.0])).estimate()
 
 
-def test_a_sequence_that_one_seed_lacks_counts_in_none():
+def test_a_sequence_with_a_missing_score_is_left_out_for_all_seeds():
     whole, part = row([1.0, None, 2.0], [2.0, 6.0, 4.0]), row([1.0, 2.0], [2.0, 4.0], clips="ab", weights=(1, 2))
     assert whole.estimate("ADE") == part.estimate("ADE")
     assert row([None] * 3).estimate("ADE") is None
-    assert row([1.0, 2.0, 3.0]).said("FDE") == "–"
+    assert row([1.0, 2.0, 3.0]).format_score("FDE") == "–"
 
 
 def test_a_reference_has_no_error_over_seeds():
@@ -31,16 +31,16 @@ def test_a_reference_has_no_error_over_seeds():
     assert model.estimate("ADE", reference).seeds == pytest.approx(model.estimate("ADE").seeds)
 
 
-def test_a_measurement_is_made_once(tmp_path):
-    made = []
-    run = lambda case, seed, out: made.append((case, seed)) or {"seconds": 2.0 + seed, "score": float("nan")}  # noqa: E731
+def test_a_measurement_runs_once(tmp_path):
+    calls = []
+    run = lambda case, seed, out: calls.append((case, seed)) or {"seconds": 2.0 + seed, "score": float("nan")}  # noqa: E731
     for seeds in ((0,), (0, 1)):
         engine.measure(tmp_path, ["KL 0.1, no w"], seeds, run)
-    assert made == [("KL 0.1, no w", 0), ("KL 0.1, no w", 1)]
-    found = engine.read(tmp_path, ["KL 0.1, no w", "KL 0.1"])
-    assert found.keys() == {"KL 0.1, no w"}
-    assert engine.budget(found.values(), 5) == "5 steps of training, 2 to 3 s of processor time."
-    assert found["KL 0.1, no w"].numbers("score") == "–"
+    assert calls == [("KL 0.1, no w", 0), ("KL 0.1, no w", 1)]
+    rows = engine.read(tmp_path, ["KL 0.1, no w", "KL 0.1"])
+    assert rows.keys() == {"KL 0.1, no w"}
+    assert engine.budget(rows.values(), 5) == "5 steps of training, 2 to 3 s of processor time."
+    assert rows["KL 0.1, no w"].numbers("score") == "–"
 
 
 def test_an_archive_has_the_same_bytes_for_the_same_measurements(tmp_path):

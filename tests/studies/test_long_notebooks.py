@@ -17,7 +17,7 @@ def one_kernel():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS[4:], ids=lambda path: path.stem)
-@pytest.mark.filterwarnings("ignore")  # the kernel's transport warns of its own affairs
+@pytest.mark.filterwarnings("ignore")  # warnings of the kernel, unrelated to the notebooks
 @pytest.mark.timeout(1200)
-def test_a_run_shows_what_is_stored(path, one_kernel):
+def test_a_run_reproduces_the_stored_outputs(path, one_kernel):
     notebooks.check(path, one_kernel)

@@ -1,4 +1,4 @@
-"""What makes the tables of results, each on little."""
+"""Run the scripts of the tables of results on little data."""
 
 import json
 import re
@@ -56,7 +56,7 @@ def dvae(*arguments):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Of people, of whom few windows are scored."""
+    """Return a folder with a small motion file."""
     folder = tmp_path_factory.mktemp("tables")
     motion.save(folder / "people.npz", motion.simulate(clips=8, frames=80, seed=1))
     return folder
@@ -69,13 +69,13 @@ def fitted(folder, name, method, *options):
 
 @pytest.fixture(autouse=True)
 def _as_many_threads(monkeypatch):
-    """As there were: scripts take one."""
+    """Keep the number of threads, which scripts set to one."""
     monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
 
 
 @pytest.fixture
 def out(tmp_path):
-    """A folder of tables."""
+    """Return a folder for tables."""
     return tmp_path / "results"
 
 
@@ -93,14 +93,14 @@ def files(out):
 
 @contextmanager
 def nothing_new(out, runs):
-    """Tables and files that are as they were."""
+    """Assert that tables and files stay unchanged."""
 
-    def found():
+    def contents():
         return files(out), {file: file.stat().st_mtime_ns for file in runs.rglob("*.json")}
 
-    before = found()
+    before = contents()
     yield
-    assert found() == before
+    assert contents() == before
 
 
 def patched(monkeypatch, module, **values):
@@ -114,9 +114,9 @@ def test_audits(out, monkeypatch):
     guides, derived, edges = tables(out, "audits/guides", "audits/derived", "audits/edges")
     assert sum(row[0] == "DKF" for row in derived) == len(alternatives(audits.FAMILY["DKF"][0]))
     assert sum(row[0] == "DKF" and row[1].endswith(" to z_t`") for row in edges) == 3  # of z_{t-1}, x_t and x_{>t}
-    prices = {row[0]: (row[3], float(row[5].split()[0])) for row in guides[1:]}
-    assert [missing for missing, _ in prices.values()] == ["–", "–", "`z_{<t}`"]
-    assert prices["VAE"][1] == prices["DKF"][1] == 0 < prices["HiT-DVAE"][1]
+    costs = {row[0]: (row[3], float(row[5].split()[0])) for row in guides[1:]}
+    assert [missing for missing, _ in costs.values()] == ["–", "–", "`z_{<t}`"]
+    assert costs["VAE"][1] == costs["DKF"][1] == 0 < costs["HiT-DVAE"][1]
 
 
 def test_bounds(out, monkeypatch):
@@ -141,8 +141,8 @@ def test_bracket(folder, out, tmp_path, monkeypatch):
     assert line[0].startswith("bracketed, ")
     assert len(head) == len(line)
     assert not {"–", ""} & {*line}
-    (kept,) = (tmp_path / "kept").iterdir()
-    kept.write_text(kept.read_text().replace('"seed"', '"other"'))
+    (stored,) = (tmp_path / "kept").iterdir()
+    stored.write_text(stored.read_text().replace('"seed"', '"other"'))
     with pytest.raises(ValueError, match="not written by Bracket"):
         bracket.main((run,), tmp_path / "kept", out, count=2, fitting=1, steps=2)
 
@@ -181,13 +181,13 @@ def test_hit_dvae(folder, out):
 def test_static(folder, out):
     run = fitted(folder, "with-w", "hit-dvae", "--pose-prior", "0", "--width", "8")
     static.main((run,), out, labels=("activity",), splits=("train",), count=5)
-    told, moved = tables(out, "hit_dvae/probes", "hit_dvae/exchanged-latents")
-    assert [row[2] for row in told[1:]] == ["w", "z", "mean and spread of poses"]
-    assert [row[1:3] for row in moved[1:]] == [*(["w", f"{share:g}"] for share in static.SHARES), ["z", "1"]]
-    assert moved[1][3:5] == ["0", "0"]
+    probes, swaps = tables(out, "hit_dvae/probes", "hit_dvae/exchanged-latents")
+    assert [row[2] for row in probes[1:]] == ["w", "z", "mean and spread of poses"]
+    assert [row[1:3] for row in swaps[1:]] == [*(["w", f"{share:g}"] for share in static.SHARES), ["z", "1"]]
+    assert swaps[1][3:5] == ["0", "0"]
 
 
-def test_probes_tell_what_is_there_and_nothing_else():
+def test_probes_find_labels_and_lengths_only_if_features_contain_them():
     torch.manual_seed(0)
     labels = [name for name in "abc" for _ in range(40)]
     places = torch.arange(120) // 4
@@ -212,7 +212,7 @@ def test_mix_and_match(tmp_path, out, monkeypatch):
     """Fitted and scored once, whatever is asked again; two alphas make a curve."""
     monkeypatch.setattr(mix_and_match, "BODY", motion.WALKER.names)
     little = {"STEPS": 2, "EVERY": 20, "SAMPLES": 3, "WATCHED": 3, "FUTURES": 5, "THINNED": 2}
-    little |= {"OPTIONS": {"width": 8}, "JUDGED": {"width": 4}, "TUNING": mix_and_match.RAW}
+    little |= {"OPTIONS": {"width": 8}, "METRIC_MODEL_OPTIONS": {"width": 4}, "TUNING": mix_and_match.RAW}
     little |= {"METRIC_MODEL": {**mix_and_match.METRIC_MODEL, "examples": 8, "steps": 2}}
     for name, value in little.items():
         monkeypatch.setattr(mix_and_match, name, value)
@@ -249,10 +249,10 @@ def test_mix_and_match(tmp_path, out, monkeypatch):
 
 @pytest.fixture
 def short(monkeypatch):
-    """Completion of simulated people, from little and for half a second."""
+    """Shorten completion: simulated people, small options, a horizon of half a second."""
     few = motion.simulate(clips=10, frames=90, seed=1)
     monkeypatch.setattr(dataset, "simulate", lambda: few)
-    monkeypatch.setattr(completion, "grouped", lambda people: people)
+    monkeypatch.setattr(completion, "split_by_group", lambda people: people)
     for name, value in {"HORIZON": 0.5, "DESCENT": Descent(2, starts=2, candidates=2, newton=0), "DRAWS": 30}.items():
         monkeypatch.setattr(completion, name, value)
     for name, value in {
@@ -263,18 +263,18 @@ def short(monkeypatch):
     }.items():
         monkeypatch.setattr(completion, name, value)
     sights = {(5, 4): False, (5, 100): False, (10, 100): True, (0, 4): True}
-    found = [completion.Sight(*sight, markers) for sight, markers in sights.items()]
-    monkeypatch.setattr(completion, "SIGHTS", {"few": found})
+    sights_tested = [completion.Sight(*sight, markers) for sight, markers in sights.items()]
+    monkeypatch.setattr(completion, "SIGHTS", {"few": sights_tested})
     return completion.Budget(some=2, known=2, steps=2, dense=20)
 
 
 def test_motion_latent(tmp_path, out, monkeypatch):
     """Results are fitted and scored only once; an interrupted run continues; several seeds give errors."""
     people = motion.simulate(clips=12, frames=90, seed=1)
-    told = [
+    labels_by_clip = [
         {**clip.labels, "file_group": "ABC"[n % 3], "content": ("walk", "run")[n % 2]} for n, clip in enumerate(people)
     ]
-    clips = [replace(clip, labels=labels) for clip, labels in zip(people, told, strict=True)]
+    clips = [replace(clip, labels=labels) for clip, labels in zip(people, labels_by_clip, strict=True)]
     motion.save(tmp_path / "people.npz", replace(people, clips=clips))
     monkeypatch.setattr(motion_latent, "PAIRS", 4)
     for cases in motion_latent.SECTIONS.values():
@@ -312,19 +312,19 @@ def test_completion(tmp_path, out, short, monkeypatch):
         completion.main(None, runs, parts=("prediction",), **options)
         completion.main(None, runs[:1], **options)
     names = "prediction", "completion-few", "completion-uncertainty"
-    curves, seen, sure = tables(out, *(f"motion_latent_4d/{name}" for name in names))
+    curves, completions, sure = tables(out, *(f"motion_latent_4d/{name}" for name in names))
     assert [row[0] for row in curves[1:4]] == ["ours", "ours, body unknown", "reconstruction"]
     assert curves[-1][0] == "segments"
-    assert [row[0] for row in seen[1:]][-2:] == ["10 points, 100 frames, markers", "0 points, 4 frames, markers"]
-    for row in seen[1:]:
+    assert [row[0] for row in completions[1:]][-2:] == ["10 points, 100 frames, markers", "0 points, 4 frames, markers"]
+    for row in completions[1:]:
         assert float(row[4].split()[0]) < float(row[1].split()[0])
-    assert [row[0] for row in sure[1:]] == [str(sight) for sight in completion.SURE]
+    assert [row[0] for row in sure[1:]] == [str(sight) for sight in completion.UNCERTAINTY_CASES]
     errors, _ = engine.read_all(tmp_path / "out", "references").runs
-    last, first = (completion.at(errors["times"][completion.moments(30.0)[1] - ahead]) for ahead in (1, 0))
+    last, first = (completion.at(errors["times"][completion.observed_times(30.0)[1] - ahead]) for ahead in (1, 0))
     for row in errors["rows"].values():
         assert max(row[last]) == 0 < min(row[first])
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    monkeypatch.setattr(completion, "TRIED", {"surface": (0.01,), "marker": (), "point": ()})
+    monkeypatch.setattr(completion, "TUNED_DEVIATIONS", {"surface": (0.01,), "marker": (), "point": ()})
     monkeypatch.setattr(completion, "DESCENTS", [])
     completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "results": None})
     assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2
@@ -332,12 +332,12 @@ def test_completion(tmp_path, out, short, monkeypatch):
         completion.main(parts=("guesses",), **options)
 
 
-def test_recurrent_poses_are_put_where_segments_start(short):
-    """What knows the future makes the true surfaces, whatever segments face and wherever they are."""
+def test_residual_poses_start_where_segments_start(short):
+    """An oracle of the future gives the true surfaces for all headings and positions."""
     data = dataset.SegmentData.open()
     segments = data.windows("test")
-    held = SimpleNamespace(model=MotionSpace(data), segments=segments, batch=segments.all())
-    people, cut = held.segments.motion, completion.protocol(30.0)
+    run = SimpleNamespace(model=MotionSpace(data), segments=segments, batch=segments.all())
+    people, cut = run.segments.motion, completion.protocol(30.0)
     windows = motion.windows(people, cut, "test")
     assert len(windows) == len(people)
 
@@ -350,7 +350,7 @@ def test_recurrent_poses_are_put_where_segments_start(short):
         def model(self, batch, length, mean_emission):
             return {"x": self.rotations(windows.all())["x"][:, cut.observed :]}
 
-    errors = completion.references(held, Oracle())["rows"]
+    errors = completion.reference_errors(run, Oracle())["rows"]
     assert max(max(row) for row in errors[completion.SUP].values()) < 5  # mm; frames of chi account for 2
     assert min([*errors[completion.STILL].values()][-1]) > 50
 
@@ -368,7 +368,7 @@ def test_rotations(folder, out):
     assert [row[0] for row in table[1:]] == [*motion.WALKER.names, "all"]
     assert (
         float(table[1][2]) == 0 < max(float(row[2]) for row in table[1:]) == float(table[-1][2])
-    )  # the root is as it was
+    )  # the root does not move
 
 
 def test_trajevae(folder, out):
@@ -411,12 +411,12 @@ def test_priors(folder, out, monkeypatch):
     assert column("prior means")[1] == "0.00"
     assert column("prior")[1] == "1.00"
     for run, off, posterior in zip(runs, column("z in units of the prior"), column("posterior"), strict=True):
-        loaded = load(run)
-        data = loaded.model.read(tuning.seen(loaded.data).given(()).all())
-        read = slice(loaded.model.method.components or None)
+        fitted_run = load(run)
+        data = fitted_run.model.read(tuning.selection_windows(fitted_run.data).given(()).all())
+        read = slice(fitted_run.model.method.components or None)
         (mean, deviation), (loc, scale) = (
             [values[:, read].detach() for values in factor["z"](data, len(data["s"]), data["y"].shape[1])]
-            for factor in (loaded.model.encoder, loaded.model.generator)
+            for factor in (fitted_run.model.encoder, fitted_run.model.generator)
         )
         assert float(posterior) == pytest.approx(float((deviation**2).mean()) ** 0.5, abs=0.006)
         second = ((mean - loc) ** 2 + deviation**2) / scale**2  # moment of a draw, in units of the prior
@@ -428,18 +428,18 @@ def test_priors(folder, out, monkeypatch):
         priors.main((fitted(folder, "without-paths", "vae", "--warm-up", 1),))
 
 
-def test_what_a_prior_has_in_common_are_the_moments_of_the_posteriors_together():
+def test_the_common_prior_has_the_moments_of_the_mixture_of_posteriors():
     torch.manual_seed(0)
     mean, deviation = torch.randn(5, 3, 2), torch.rand(5, 3, 2)
-    common = priors.together((mean, deviation))
+    common = priors.pooled((mean, deviation))
     draws = (mean + deviation * torch.randn(20_000, 5, 3, 2)).flatten(0, 1)
-    for found, of in zip(common, (draws.mean(0), draws.std(0)), strict=True):
-        torch.testing.assert_close(found, of, atol=0.03, rtol=0)
-    own = torch.randn(7, 4, 2), torch.rand(7, 4, 2)  # the last step is not used
-    for what in ((), ("mean",), ("deviation",), ("mean", "deviation")):
-        made = priors.with_common(lambda: own, common, what)()
-        for name, values, before, after in zip(("mean", "deviation"), made, own, common, strict=True):
-            assert (values[:, :3] == (after if name in what else before[:, :3])).all()
+    for moment, expected in zip(common, (draws.mean(0), draws.std(0)), strict=True):
+        torch.testing.assert_close(moment, expected, atol=0.03, rtol=0)
+    prior = torch.randn(7, 4, 2), torch.rand(7, 4, 2)  # the last step is not used
+    for parts in ((), ("mean",), ("deviation",), ("mean", "deviation")):
+        replaced = priors.with_common(lambda: prior, common, parts)()
+        for name, values, before, after in zip(("mean", "deviation"), replaced, prior, common, strict=True):
+            assert (values[:, :3] == (after if name in parts else before[:, :3])).all()
             assert (values[:, 3] == before[:, 3]).all()
 
 
@@ -480,7 +480,7 @@ def test_ranking(folder, out, monkeypatch):
     (best,) = re.findall(
         r"^May be the best, .* with 2 seeds or more: (.*)\.$", results.read("index/simulated", out).note
     )
-    assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # of the other there is one seed
+    assert set(best.split(", ")) <= {"zero velocity", "nearest neighbours", "srnn"}  # the other has one seed
     (rows,) = tables(out, "index/simulated")
     by_name = {row[0]: row for row in rows[1:]}
     assert by_name.keys() == {"zero velocity", "nearest neighbours", *methods}
@@ -491,7 +491,7 @@ def test_ranking(folder, out, monkeypatch):
         assert abs(float(row[4].split()[0]) - (energy - before)) < 0.0016  # of three rounded numbers
 
 
-def test_a_table_is_read_as_it_was_written(out, capsys):
+def test_reading_a_table_returns_the_written_table(out, capsys):
     table = results.Table(["", "a, b"], [["`p(z | x)`", 'the "first" ± 1'], ["ä", ""]], "A note.")
     results.write(out, {"some/table": table})
     assert results.read("some/table", out) == table
@@ -501,18 +501,20 @@ def test_a_table_is_read_as_it_was_written(out, capsys):
     assert "A note.\n\n|  | a, b |\n| --- | ---: |\n| `p(z \\| x)` |" in capsys.readouterr().out
 
 
-def test_minutes_are_told_of_processors():
-    def told(**minutes):
-        found = [{"minutes": n, "config": {"training": {"accelerator": where}}} for where, n in minutes.items()]
-        return ranking.trained(engine.Row(found))
+def test_minutes_are_means_over_fits_on_a_cpu():
+    def cells(**minutes):
+        runs = [
+            {"minutes": n, "config": {"training": {"accelerator": accelerator}}} for accelerator, n in minutes.items()
+        ]
+        return ranking.training_cells(engine.Row(runs))
 
-    assert told(auto=4.0, cuda=1.0) == ("2", "4.0")
-    assert told(auto=4.0, cpu=6.0) == ("2", "5.0")
-    assert told(cuda=1.0) == ("1", "GPU")
+    assert cells(auto=4.0, cuda=1.0) == ("2", "4.0")
+    assert cells(auto=4.0, cpu=6.0) == ("2", "5.0")
+    assert cells(cuda=1.0) == ("1", "GPU")
 
 
-def test_the_nearest_of_many_are_the_nearest():
-    """By the lower body, over all frames; the first is one of them."""
+def test_selected_futures_have_the_nearest_lower_bodies():
+    """Distances are over all frames; the first future is selected too."""
     drawn = torch.randn(60, 2, 5, 4, generator=torch.Generator().manual_seed(0))
 
     class Drawn(torch.nn.Module):
@@ -521,17 +523,17 @@ def test_the_nearest_of_many_are_the_nearest():
         def forecast(self, past, horizon, samples, **options):
             return {"x": drawn[:samples], "z": drawn}
 
-    found = ranking.Nearest(Drawn(), [0, 3]).forecast({}, 5, 3)["x"]
-    assert found.shape == (3, 2, 5, 4)
-    assert found[0].equal(drawn[0])
+    nearest = ranking.NearestLowerBody(Drawn(), [0, 3]).forecast({}, 5, 3)["x"]
+    assert nearest.shape == (3, 2, 5, 4)
+    assert nearest[0].equal(drawn[0])
     for sequence in range(2):
-        away = [(each[:, [0, 3]] - drawn[0, sequence][:, [0, 3]]).norm() for each in drawn[:, sequence]]
-        expected = [drawn[n, sequence] for n in np.argsort(away)[:3]]
-        assert all(map(torch.equal, found[:, sequence], expected))
+        distances = [(each[:, [0, 3]] - drawn[0, sequence][:, [0, 3]]).norm() for each in drawn[:, sequence]]
+        expected = [drawn[n, sequence] for n in np.argsort(distances)[:3]]
+        assert all(map(torch.equal, nearest[:, sequence], expected))
 
 
-def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
-    """Of the lower body, whose motion is then one and the same."""
+def test_futures_with_a_fixed_lower_body_differ_only_in_the_upper_body(folder, monkeypatch):
+    """Futures with a fixed lower-body draw share the motion of the lower body."""
     small = {"pose_prior": 0.0, "draws": (2, 2), "latent": 4, "width": 4, "steps": 2, "batch_size": 4}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", {})})
     views = [ranking.View(parts=parts) for parts in ("free", "held", "nearest")]
@@ -549,7 +551,7 @@ def test_a_draw_is_held_where_there_is_one(folder, monkeypatch):
     assert (whole < sum(parts)).all()
 
 
-def test_judges_say_nothing_of_their_place_and_are_whole_while_others_use_them(folder, tmp_path, monkeypatch):
+def test_metric_models_contain_no_paths_and_are_written_once(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(ranking.METRIC_MODELS, "prior", ("pose-prior", {}, Training(2, 4, progress=False)))
     data = motion.MotionData.open(folder / "people.npz", motion.PROTOCOLS["simulated"])
     config = ranking.fitted_metric_models(data, tmp_path, ["prior"])["prior"] / "config.json"
@@ -560,7 +562,7 @@ def test_judges_say_nothing_of_their_place_and_are_whole_while_others_use_them(f
 
 
 def test_every_row_has_a_folder_of_its_own():
-    """By a name that a sweep takes."""
+    """A sweep accepts the names."""
     sets = [each.methods for each in ranking.SETS.values()]
     for rows in [*sets, *(each.rows for each in papers.PAPERS.values()), *(s.cases for s in tuning.SECTIONS.values())]:
         folders = [engine.folder(row) for row in rows]
@@ -572,24 +574,24 @@ def test_every_row_has_options_of_its_method():
     sets = [each.methods for each in ranking.SETS.values()]
     for rows in [*sets, *(each.rows for each in papers.PAPERS.values())]:
         for row, options in rows.items():
-            told, training = ranking.parted(options)
-            made = method(told.pop("method", row), **told)
-            replace(made.trainings[""], **training)
+            method_options, training = ranking.split_options(options)
+            built = method(method_options.pop("method", row), **method_options)
+            replace(built.trainings[""], **training)
 
 
 def test_groups_are_of_the_first_word():
     people = motion.simulate(clips=2, frames=80, seed=1)
     contents = ("walk-turn-left", "run")
     clips = [replace(clip, labels={"content": name}) for clip, name in zip(people, contents, strict=True)]
-    data = ranking.grouped(
+    data = ranking.with_groups(
         motion.MotionData("", motion.MotionSet(clips, people.skeleton), motion.PROTOCOLS["simulated"])
     )
     assert [clip.labels["group"] for clip in data.motion] == ["walk", "run"]
     assert [clip.labels["content"] for clip in data.motion] == list(contents)
 
 
-def test_a_second_stage_alone_stands_on_the_first_of_its_set(folder, tmp_path, monkeypatch):
-    """Where the first is not chosen, too."""
+def test_a_second_stage_uses_the_first_stage_of_its_set(folder, tmp_path, monkeypatch):
+    """Fit the first stage even if it is not selected."""
     small = {"width": 4, "latent": 2, "batch_size": 4}
     methods = {"cvae": {**small, "steps": 3}, "dlow": {"modes": 2, "steps": 2, "batch_size": 4}}
     monkeypatch.setattr(ranking, "SETS", {"simulated": ranking.Set("people.npz", methods)})
@@ -599,18 +601,20 @@ def test_a_second_stage_alone_stands_on_the_first_of_its_set(folder, tmp_path, m
     assert not any(name.startswith("cvae-") for name in ranking.archive(tmp_path / "scores", "simulated").names)
 
 
-def test_a_set_like_another_has_its_judges_and_reference_rows(folder, tmp_path, capsys, monkeypatch):
-    """And its windows, but rows of its own."""
+def test_a_set_like_another_shares_its_metric_models_and_reference_rows(folder, tmp_path, capsys, monkeypatch):
+    """Windows are shared too; rows of methods are separate."""
     small = {"width": 4, "latent": 2, "warm_up": 1, "batch_size": 4}
     first = ranking.Set("people.npz", {"srnn": {**small, "steps": 2}})
     second = replace(first, methods={"srnn": {**small, "steps": 3}}, like="simulated")
-    judged = []
+    sets_with_metric_models = []
     monkeypatch.setattr(ranking, "SETS", {"simulated": first, "longer": second})
-    monkeypatch.setattr(ranking, "fitted_metric_models", lambda data, path, names: judged.append(path.name) or {})
+    monkeypatch.setattr(
+        ranking, "fitted_metric_models", lambda data, path, names: sets_with_metric_models.append(path.name) or {}
+    )
     for name in ranking.SETS:
-        assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # reference rows alone are no table
+        assert ranking.rows_of(tmp_path / "scores", "longer", ranking.View()) == {}  # no table of reference rows alone
         ranking.main(tmp_path, folder, seeds=(0,), samples=2, sets=(name,), scores=tmp_path / "scores")
-    assert judged == ["simulated", "simulated"]
+    assert sets_with_metric_models == ["simulated", "simulated"]
     names = ranking.archive(tmp_path / "scores", "longer").names
     assert names
     assert not any(name.startswith(f"{ranking.REFERENCES}/") for name in names)
@@ -640,17 +644,17 @@ def test_papers(folder, out, monkeypatch):
     monkeypatch.setattr(ranking, "SETS", {paper.set: ranking.Set("people.npz", {})})
     monkeypatch.setattr(ranking, "JOINTS", ("RFoot",))
     monkeypatch.setattr(papers, "JOINTS", ("RFoot",))
-    where = {"stored": folder / "scores", "results": out, "pictures": folder}
+    folders = {"stored": folder / "scores", "results": out, "pictures": folder}
     for data in (folder, None):
-        papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **where)
+        papers.main(folder / "papers", data, ("page",), samples=3, seeds=(0, 1), **folders)
     names = ("scores", "changes", "further-paths", "one-motion-scores")
     assert {file.stem for file in (out / "page").glob("*.csv")} == {*names}
     rows, compared, more, single = tables(out, *(f"page/{name}" for name in names))
-    named = {(row[0], row[1]): row[2:] for row in rows[1:]}
+    cells = {(row[0], row[1]): row[2:] for row in rows[1:]}
     runs = {(name, count) for name in paper.rows for count in "01"}
-    assert named.keys() == {("zero velocity", ""), ("nearest neighbours", ""), ("*Human3.6M: TrajeVAE*", "0"), *runs}
-    assert named["*Human3.6M: TrajeVAE*", "0"] == ["", "", "8.462", ".518"]
-    ades = {key: float(named[key][3].split()[0]) for key in runs}
+    assert cells.keys() == {("zero velocity", ""), ("nearest neighbours", ""), ("*Human3.6M: TrajeVAE*", "0"), *runs}
+    assert cells["*Human3.6M: TrajeVAE*", "0"] == ["", "", "8.462", ".518"]
+    ades = {key: float(cells[key][3].split()[0]) for key in runs}
     for count, change in zip("01", compared[1][3:], strict=True):
         assert abs(float(change.split()[0]) - (ades["trajevae", count] - ades["whole poses", count])) < 0.0016
     assert more[0][1:] == ["score", "RFoot too"]
@@ -658,8 +662,8 @@ def test_papers(folder, out, monkeypatch):
     assert [row[:2] for row in single[1:]] == [["trajevae", "1"]]
     assert single[1][4].startswith("0.000")  # one motion has no diversity
     assert (folder / "page.png").stat().st_size > 0
-    found = {view: ranking.entries(folder / "scores", paper.set, view, paper.rows) for view in paper.views}
-    errors, *_ = papers.drawn(found, paper).axes
+    rows_by_view = {view: ranking.entries(folder / "scores", paper.set, view, paper.rows) for view in paper.views}
+    errors, *_ = papers.draw_scores(rows_by_view, paper).axes
     for row, line in zip(paper.rows, (line for line in errors.lines if line.get_marker() == "o"), strict=True):
         assert [*line.get_xdata()] == [0, 1]
         assert line.get_ydata() == pytest.approx([ades[row, count] for count in "01"], abs=0.0006)
@@ -686,7 +690,7 @@ def test_tuning(folder, out, monkeypatch):
         assert paths.keys() == {*tuning.REFERENCES, "preset"}
         assert re.match(r"[\d.]+ \([\d.]+, [\d.]+\)", futures["preset"][0])
         assert futures["preset"] != futures["wide, longer"]
-        assert tuning.Store(folder / "tuning", "cvae").found.keys() == cases.keys()
+        assert tuning.Store(folder / "tuning", "cvae").scores.keys() == cases.keys()
         shutil.rmtree(folder / "tuned", ignore_errors=True)  # scored, which is enough
     failing = {"without a prior": {"method": "gsps", "pose_prior_run": "nowhere"}}
     monkeypatch.setitem(sections, "cvae", replace(sections["cvae"], cases=failing))
@@ -695,7 +699,7 @@ def test_tuning(folder, out, monkeypatch):
 
 
 def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, out, monkeypatch):
-    """Which has the determinant that the score of futures leaves out."""
+    """The density includes the determinant, which the score of futures leaves out."""
     protocol = motion.PROTOCOLS["simulated"]
     training = Training(2, 4, learning_rate=0.01, progress=False)
     patched(
@@ -711,24 +715,24 @@ def test_pose_priors_are_tuned_by_their_density(folder, tmp_path, out, monkeypat
     tuning.main(tmp_path, folder / "people.npz", ("metric_models",), stored=tmp_path / "scores", results=out)
     (rows,) = tables(out, "tuning/metric_models")
     assert [row[-1] for row in rows[1:]] == ["–", "–"]
-    found = tuning.Store(tmp_path / "scores", "metric_models").found
-    assert all(seeds.keys() == {"0", "1"} for seeds in found.values())
+    scores = tuning.Store(tmp_path / "scores", "metric_models").scores
+    assert all(seeds.keys() == {"0", "1"} for seeds in scores.values())
     prior = load(tmp_path / "metric_models" / "prior-30-steps-seed1").model
-    told = found["prior 30 steps"]["1"]
-    windows = tuning.seen(motion.MotionData.open(folder / "people.npz", protocol)).all()["x"]
+    prior_scores = scores["prior 30 steps"]["1"]
+    windows = tuning.selection_windows(motion.MotionData.open(folder / "people.npz", protocol)).all()["x"]
     density = prior.log_prob(prior.facing(windows)[:, protocol.observed :]).mean().item()
-    assert told["log density"] == pytest.approx(density, abs=1e-3)
-    assert abs(told["pose NLL"] + density) > 1
+    assert prior_scores["log density"] == pytest.approx(density, abs=1e-3)
+    assert abs(prior_scores["pose NLL"] + density) > 1
 
 
-def test_gsps_has_the_prior_of_its_judge_where_it_sees_poses_as_the_judge_does(tmp_path):
+def test_gsps_uses_the_pose_prior_of_the_metric_models_for_rotated_poses_only(tmp_path):
     cases = ("6500 steps", "not turned")
-    told = {case: tuning.SECTIONS["gsps"].of(case, tmp_path)[0].pose_prior_run for case in cases}
-    assert told == {"6500 steps": str(tmp_path), "not turned": ""}
+    pose_priors = {case: tuning.SECTIONS["gsps"].of(case, tmp_path)[0].pose_prior_run for case in cases}
+    assert pose_priors == {"6500 steps": str(tmp_path), "not turned": ""}
 
 
 def test_irregular(tmp_path, out, monkeypatch):
-    """Fitted and scored once, whatever is asked again; runs are judged on the same halves of the same sequences."""
+    """Fitted and scored once, whatever is asked again; runs are scored on the same halves of the same sequences."""
     random = np.random.default_rng(0)
     parts = ["train", "validation", "test"] * 4
     series = [Series(str(n), random.normal(size=(5 + n, 2)), split=part) for n, part in enumerate(parts)]
@@ -740,18 +744,18 @@ def test_irregular(tmp_path, out, monkeypatch):
     irregular.main(part="test", **options)
     with nothing_new(out, tmp_path / "runs"):
         irregular.main(part="test", **options)
-    (found,) = tables(out, "irregular/latent-2")
-    rows = {row[0]: row[1:] for row in found[1:]}
-    for kept in irregular.KEPT:
+    (table,) = tables(out, "irregular/latent-2")
+    rows = {row[0]: row[1:] for row in table[1:]}
+    for share in irregular.KEPT:
         whole, halves, less = (
             float(cell.split()[0])
-            for cell in (rows[f"whole, tested on {kept}"][0], *rows[f"halves, tested on {kept}"][:2])
+            for cell in (rows[f"whole, tested on {share}"][0], *rows[f"halves, tested on {share}"][:2])
         )
         assert abs(halves - whole - less) < 0.0016  # of three rounded numbers
-        assert f"independent frames, tested on {kept}" in rows
+        assert f"independent frames, tested on {share}" in rows
 
 
-def test_halves_keep_times_between_frames_and_no_frame_twice():
+def test_halves_have_distinct_frames_with_the_times_between_them():
     sequences = [np.arange(n, dtype=float)[:, None].repeat(2, 1) for n in (3, 8, 12)]
     batch = irregular.batch_of(sequences, 0.5, 3)
     assert batch["lengths"].tolist() == [2, 4, 6]
@@ -764,7 +768,7 @@ def test_halves_keep_times_between_frames_and_no_frame_twice():
     assert torch.equal(irregular.frames(whole), torch.cat([torch.from_numpy(x).float() for x in sequences]))
 
 
-def test_gaps_are_as_long_as_they_are():
+def test_every_entry_of_a_gap_has_the_length_of_the_gap():
     mask = torch.tensor([1, 0, 0, 1, 1, 0, 0, 0, 1, 0]).bool()
     assert occlusion.bursts(mask[None, :, None])[0, :, 0].tolist() == [0, 2, 2, 0, 0, 3, 3, 3, 0, 1]
 
@@ -774,15 +778,15 @@ def benches(tmp_path, monkeypatch, capsys):
     """Run benchmarks with given rows, one tuple for each measurement; return the status and the last line."""
     monkeypatch.setattr(bench, "HISTORY", tmp_path / "history.json")
     monkeypatch.setattr(bench, "tabulate", partial(bench.tabulate, results=tmp_path))
-    monkeypatch.setattr(bench, "there", lambda *_: {})
+    monkeypatch.setattr(bench, "measure_at_commit", lambda *_: {})
 
-    def run(*found, targets=BENCHES, commit="b", version="1.0", keep=False):
-        left = [dict(zip(targets, rows, strict=True)) for rows in found]
-        monkeypatch.setattr(bench, "measured", lambda name, device: (dict(left.pop(0)), targets))
+    def run(*measurements, targets=BENCHES, commit="b", version="1.0", keep=False):
+        remaining = [dict(zip(targets, rows, strict=True)) for rows in measurements]
+        monkeypatch.setattr(bench, "measured", lambda name, device: (dict(remaining.pop(0)), targets))
         monkeypatch.setattr(bench, "commit", lambda: commit)
         monkeypatch.setattr(bench.dvae, "__version__", version)
         status = bench.main(("speed",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=keep)
-        assert not left
+        assert not remaining
         return status, capsys.readouterr().out.splitlines()[-1].strip()
 
     run.row = lambda name: {row[0]: row[1:] for row in results.read("speed/history", tmp_path).rows}[name]
@@ -800,13 +804,13 @@ BENCHES = {
 
 def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(benches):
     benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
-    assert benches((1.09, 3.7, 7.6, 0.9))[0] == 0  # within a tenth, or of an exponent within its bound
+    assert benches((1.09, 3.7, 7.6, 0.9))[0] == 0  # within a tenth; an exponent within its bound
     assert benches((1.3, 4.0, 9.0, 0.01), (1.05, 4.0, 7.0, 0.01))[0] == 0  # the better of two
     step = (1, "speed: step: 1.20 was 1.00 at the last release")
     assert benches((1.3, 4.0, 7.0, 0.01), (1.2, 4.0, 7.0, 0.01)) == step
-    gain = (1, "speed: gain: 2.90 was 4.00 at the last release")  # is worse where it is less
+    gain = (1, "speed: gain: 2.90 was 4.00 at the last release")  # lower is worse
     assert benches((1.0, 2.0, 7.0, 0.01), (1.0, 2.9, 7.0, 0.01)) == gain
-    cost = (1, "speed: cost: 8.00 was 7.00 at the last release")  # which has no target
+    cost = (1, "speed: cost: 8.00 was 7.00 at the last release")  # has no target
     assert benches((1.0, 4.0, 8.0, 0.01), (1.0, 4.0, 8.0, 0.01)) == cost
     assert benches((1.0, 4.0, 7.0, 1.2), (1.0, 4.0, 7.0, 1.2)) == (
         1,
@@ -814,26 +818,26 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(benches
     )
 
 
-def test_a_target_that_was_missed_before_is_told_and_fails_nothing(benches):
+def test_a_target_that_was_missed_before_is_reported_without_failure(benches):
     benches((2.5, 4.0, 7.0, 0.01), commit="a", keep=True)
     assert benches((2.6, 4.0, 7.0, 0.01)) == (0, "speed: step: 2.60 must be at most 2")
 
 
-def test_a_slower_row_is_measured_beside_the_code_of_the_release(benches, monkeypatch):
+def test_a_slower_row_is_compared_with_the_code_of_the_release(benches, monkeypatch):
     """This machine may be the slower one."""
     benches((1.0, 4.0, 7.0, 0.01), commit="a", keep=True)
-    monkeypatch.setenv(bench.BESIDE, "1")
-    assert benches((9.0, 1.0, 9.0, 0.01))[0] == 0  # is not compared itself
-    monkeypatch.delenv(bench.BESIDE)
-    asked = []
-    beside = {"speed: step": 1.15, "speed: cost": 6.0}  # the second was not in doubt
-    monkeypatch.setattr(bench, "there", lambda *given: asked.append(given[:2]) or beside)
+    monkeypatch.setenv(bench.RELEASE_RUN, "1")
+    assert benches((9.0, 1.0, 9.0, 0.01))[0] == 0  # no comparison
+    monkeypatch.delenv(bench.RELEASE_RUN)
+    requests = []
+    release = {"speed: step": 1.15, "speed: cost": 6.0}  # the second did not get slower
+    monkeypatch.setattr(bench, "measure_at_commit", lambda *given: requests.append(given[:2]) or release)
     assert benches((1.2, 4.0, 7.0, 0.01), (1.2, 4.0, 7.0, 0.01))[0] == 0
     assert benches((1.3, 4.0, 7.0, 0.01), (1.3, 4.0, 7.0, 0.01)) == (
         1,
         "speed: step: 1.30 was 1.15 at the last release",
     )
-    assert asked == [("a", "speed")] * 2
+    assert requests == [("a", "speed")] * 2
 
 
 def test_a_release_is_the_first_record_of_its_version(benches):
@@ -845,14 +849,14 @@ def test_a_release_is_the_first_record_of_its_version(benches):
     first, second = json.loads(benches.history.read_text())
     assert first["rows"] == dict(zip(BENCHES, (1.0, 4.0, 7.0, 0.01), strict=True))
     assert second["rows"] == {**dict(zip(BENCHES, (1.08, 5.0, 7.0, 0.01), strict=True)), "speed: other": 3.0}
-    assert benches((1.12, 5.0, 7.0, 0.01), (1.12, 5.0, 7.0, 0.01), commit="c")[0] == 1  # though not of the second
+    assert benches((1.12, 5.0, 7.0, 0.01), (1.12, 5.0, 7.0, 0.01), commit="c")[0] == 1  # compared with the first record
     benches((1.1, 5.0, 7.0, 0.01), commit="d", version="2.0", keep=True)
     assert benches((1.2, 5.0, 7.0, 0.01), commit="e", version="2.0")[0] == 0
     assert benches.row("speed: step") == ["at most 2", "yes", "1.10", "1.00", "1.10"]
 
 
 def test_a_release_is_measured_by_its_own_code(tmp_path, monkeypatch):
-    """In a folder of its own, which is gone after it."""
+    """The code is in a temporary worktree."""
     git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", tmp_path]
     (tmp_path / "benchmarks").mkdir()
     program = 'import sys, pathlib; pathlib.Path(sys.argv[-1]).write_text(\'{"rows": {"speed: step": %s}}\')'
@@ -863,14 +867,14 @@ def test_a_release_is_measured_by_its_own_code(tmp_path, monkeypatch):
         subprocess.run([*git, "commit", "-qm", str(value)], check=True)
     monkeypatch.setattr(bench, "HERE", tmp_path / "benchmarks")
     before = subprocess.run([*git, "rev-parse", "HEAD~1"], check=True, capture_output=True, text=True).stdout.strip()
-    assert bench.there(before, "speed", "cpu", 1) == {"speed: step": 1}
-    assert bench.there(bench.commit(), "speed", "cpu", 1) == {"speed: step": 2}
-    assert bench.there("0" * 40, "speed", "cpu", 1) == {}
-    listed = subprocess.run([*git, "worktree", "list"], check=True, capture_output=True, text=True).stdout
-    assert len(listed.splitlines()) == 1
+    assert bench.measure_at_commit(before, "speed", "cpu", 1) == {"speed: step": 1}
+    assert bench.measure_at_commit(bench.commit(), "speed", "cpu", 1) == {"speed: step": 2}
+    assert bench.measure_at_commit("0" * 40, "speed", "cpu", 1) == {}
+    worktrees = subprocess.run([*git, "worktree", "list"], check=True, capture_output=True, text=True).stdout
+    assert len(worktrees.splitlines()) == 1
 
 
-def test_wrong_arguments_of_benchmarks_are_told_before_anything_is_measured(tmp_path):
+def test_wrong_arguments_of_benchmarks_are_errors_before_any_measurement(tmp_path):
     for options, message in (
         ({"threads": 0}, "threads must be at least 1, got 0"),
         ({"out": tmp_path / "no" / "x.json"}, "is in a folder that does not exist; create .*no first"),
@@ -880,7 +884,7 @@ def test_wrong_arguments_of_benchmarks_are_told_before_anything_is_measured(tmp_
             bench.main(**options)
 
 
-def test_products_alone_are_those_of_the_work():
+def test_recorded_products_have_the_shapes_of_the_work():
     x, y = torch.randn(3, 4, requires_grad=True), torch.randn(4, 2)
     query, token = torch.randn(2, 1, 5, 4), torch.randn(2, 1, 6, 4)
     with speed.Products() as noted:
@@ -889,7 +893,9 @@ def test_products_alone_are_those_of_the_work():
         torch.mm(x.detach(), y, out=torch.empty(3, 2))
         torch.nn.functional.scaled_dot_product_attention(query, token, token, attn_mask=torch.zeros(2, 1, 5, 6))
     shapes = [
-        [tuple(value.shape) for value in args if isinstance(value, torch.Tensor)]  # without the mask, widened or not
+        [
+            tuple(value.shape) for value in args if isinstance(value, torch.Tensor)
+        ]  # without the mask, whose shape varies
         for _, args, _ in noted.calls
     ]
     assert shapes == [
@@ -915,10 +921,10 @@ def test_packages(tmp_path):
         graph
     ) - {"cli", "data", "tables", "testing"}
     assert len(graph) <= 12
-    assert graph.has_edge("models", "inference")  # behind links, and by a relative import
+    assert graph.has_edge("models", "inference")  # through links and a relative import
     assert graph.has_edge("inference", "program")
 
 
-def test_packages_stand_on_what_they_import():
+def test_packages_are_above_their_imports():
     graph = nx.DiGraph([("roof", "walls"), ("walls", "ground"), ("roof", "ground"), ("shed", "ground")])
-    assert packages.storeys(graph) == [["ground"], ["shed", "walls"], ["roof"]]
+    assert packages.levels_of(graph) == [["ground"], ["shed", "walls"], ["roof"]]

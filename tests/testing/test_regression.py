@@ -399,8 +399,7 @@ def test_pytest_finds_the_plugin_and_does_not_wait_for_torch():
 # ------------------------------------------------------------------------------------------------- used for real
 
 
-def test_the_price_of_a_mean_field_guide(elbo_regression):
-    """The best mean-field guide of a fixed model has the same bound on every machine."""
+def test_a_mean_field_guide_has_the_same_bound_on_every_machine(elbo_regression):
     model = linear_gaussian_surrogate("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2}, 6)
     with torch.no_grad():
         for parameter in model.generator.parameters():
