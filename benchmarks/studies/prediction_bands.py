@@ -179,7 +179,7 @@ def tables_of_split(model: Any, dataset: MotionData, thinned: motion.Protocol) -
         ]
         for region in REGIONS
     ]
-    covered = Table(["held at once", "said", "width said (m)", "conformal", "width conformal (m)"], lines)
+    covered = Table(["region", "raw", "width raw (m)", "calibrated", "width calibrated (m)"], lines)
     scores = dvae.evaluate(
         model, halves[1], scores=over_horizon, samples=SAMPLES, draw_emission=True, references=False, progress=False
     )["model"]
