@@ -26,7 +26,7 @@ def spread(cost: torch.Tensor) -> str:
 def derived(names: Sequence[str]) -> Table:
     """Return a table of the guides of some models without missing dependencies, with their cost."""
     rows = [(name, f"`{guide}`", *rest) for name in names for guide, *rest in dvae.alternatives(FAMILY[name][0]).rows]
-    return Table(["", "guide", "drawn", "edges", "looped", "KL by draws"], rows)
+    return Table(["", "guide", "order", "edges", "sequential", "sampled KL"], rows)
 
 
 def edge_rows(names: Sequence[str], steps: int, seeds: int) -> Table:

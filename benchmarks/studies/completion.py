@@ -392,7 +392,7 @@ def measure_coverage(
     def places(frames: Tensor, shape: Tensor) -> Tensor:
         """Return the coordinates (..., P) of every `THIN`-th vertex in every `THIN`-th frame."""
         rotations, translation = model.timed.poses(frames[..., ::THIN, :])
-        deviations_mm: Tensor = model.body.some(shape, rotations, translation, vertices_used)
+        deviations_mm: Tensor = model.body.select_vertices(shape, rotations, translation, vertices_used)
         return deviations_mm.flatten(-3)
 
     def within(samples: Tensor, truth: Tensor, noise: float = 0.0) -> Tensor:

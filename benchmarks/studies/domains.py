@@ -196,7 +196,7 @@ def forecasts(case: str, seed: int, model: Any, data: Data) -> dict[str, Any]:
     evaluation = dvae.evaluate(
         {OURS: model}, windows("test"), scores=forecast_scores, training_windows=windows("train"), **options
     )
-    return scores_of(evaluation.clips, {name: row.clip_means for name, row in evaluation.rows.items()})
+    return scores_of(evaluation.clusters, {name: row.cluster_means for name, row in evaluation.rows.items()})
 
 
 def run(data: Data, part: str, case: str, seed: int, out: Path) -> dict[str, Any]:

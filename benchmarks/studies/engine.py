@@ -168,7 +168,7 @@ class Row:
         if len(order) == len(clips):  # no sums by clip, so that equal seeds have exactly no error
             errors = TwoWayErrors.of(values, weights)
         else:
-            errors = TwoWayErrors.by_clip(values * weights, weights, np.array([order[clip] for clip in clips]))
+            errors = TwoWayErrors.by_cluster(values * weights, weights, np.array([order[clip] for clip in clips]))
         return errors if self.trained else replace(errors, seeds=0.0, rest=0.0, count=sys.maxsize)
 
     def estimate(self, score: str, other: Row | None = None) -> Estimate | None:

@@ -92,13 +92,13 @@ def recorded(path: Path) -> motion.MotionSet:
     twice the true rate of salsa_10 (see the notes of the data).
     """
     people = [
-        motion.read_motion(file, joints=BODY, fps=60 if file.stem == "salsa_10" else None).resampled(30)
+        motion.read_motion(file, joints=BODY, fps=60 if file.stem == "salsa_10" else None).resample(30)
         for file in sorted(path.rglob("*.bvh"))
     ]
     if not people:
         sys.exit(f"there is no .bvh file in {path}")
     clips = [clip.between(3, clip.frames) for each in people for clip in each]
-    return replace(people[0], clips=clips, name=RAW).divided(1 / 3, 75)
+    return replace(people[0], clips=clips, name=RAW).assign_splits(1 / 3, 75)
 
 
 def data_of(protocol: str, file: Path) -> motion.MotionData:
@@ -145,7 +145,7 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
     qualities = quality({OURS: model}, train, test, **quality_options)
     futures = {
         name: {score: row[score][0] for score in row}
-        | {score: evaluation.rows[name].clip_means[score] for score in SCORES}
+        | {score: evaluation.rows[name].cluster_means[score] for score in SCORES}
         for name, row in qualities.rows.items()
     }
     measurement: dict[str, Any] = {
@@ -153,14 +153,16 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
         "steps": watched,
         "codes": {"diversity": diversity, "deviation": fit.series("codes/deviation")[1]},
         "KL": float(np.mean(late)) if late else None,
-        "futures": scores_of(evaluation.clips, futures),
+        "futures": scores_of(evaluation.clusters, futures),
         "jerk": next(note for note in evaluation.notes if note.startswith("jerk")),
         PROBED: evaluation.ratio(PROBED, OURS, "APD").mean if PROBED in models else None,
     }
     if full:
         counts = [count for count in COUNTS if count <= (FUTURES if case == "mix, velocity" else samples)]
         angles = euler_errors({OURS: model}, fewer, counts=counts, **options)
-        measurement["angles"] = scores_of(angles.clips, {name: plain(angles.rows[name].clip_means) for name in futures})
+        measurement["angles"] = scores_of(
+            angles.clusters, {name: plain(angles.rows[name].cluster_means) for name in futures}
+        )
     if method.noise == "mix" and noise:
         # Ratios of diversity. Codes: indices drawn once over all drawn. Futures: z at 0, so that only indices differ,
         # over all drawn.

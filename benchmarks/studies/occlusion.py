@@ -19,7 +19,7 @@ from dvae import motion
 from dvae.data import Batch
 from dvae.data.sequences import interpolate_missing
 from dvae.inference.evaluation.estimates import clustered_variance, linearised
-from dvae.inference.evaluation.evaluation_windows import clip_index
+from dvae.inference.evaluation.evaluation_windows import cluster_index
 from dvae.inference.evaluation.references import distances
 
 from .results import Table, write
@@ -127,7 +127,7 @@ def main(
     dataset = motion.MotionData(str(data), motion.occlude(recording, share, length), motion.PROTOCOLS[protocol])
     test, training = dataset.windows("test"), dataset.windows("train+validation")
     batch, truth = test.all(stride), motion.windows(recording, dataset.protocol, "test").all(stride)["x"]
-    places = clip_index(test.index(stride)).numpy()
+    places = cluster_index(test.index(stride)).numpy()
     gaps = bursts(batch["mask"]).unflatten(-1, (-1, 3))[..., 0]
 
     weights = sums(torch.ones_like(gaps), gaps, places)

@@ -22,12 +22,12 @@ from dvae.inference.evaluation.conformal import REGIONS, largest_by_region, quan
 from dvae.inference.evaluation.evaluate import forecaster_of, forecasts_of
 from dvae.inference.evaluation.evaluation_windows import (
     EvaluationWindows,
-    clip_index,
+    cluster_index,
     prepare_windows,
     seeded_evaluation,
 )
 from dvae.inference.evaluation.references import References
-from dvae.inference.evaluation.scores import clip_means, over_horizon
+from dvae.inference.evaluation.scores import cluster_means, over_horizon
 from dvae.motion.data.dataset import MotionData
 
 from .results import Table, write
@@ -63,14 +63,14 @@ class ForecastDistances:
             [standardised(forecasts, true, forecasts.std(1) if spread is None else spread) for forecasts, true in parts]
         )
         by_region = {region: largest_by_region(torch.cat(distances), region) for region in REGIONS}
-        return cls(by_region, clip_index(windows.keys), np.array(windows.labels("style")))
+        return cls(by_region, cluster_index(windows.keys), np.array(windows.labels("style")))
 
     def coverage(self, region: str, calibration: np.ndarray, test: np.ndarray) -> float:
         """Return the mean share over test clips of windows inside the bands of the calibration windows."""
         clips, test_clips = (self.places[windows].unique(return_inverse=True)[1] for windows in (calibration, test))
         factor = quantile(self.distances[region][calibration], clips, LEVEL)
         inside = (self.distances[region][test] <= factor).double().mean((1, 2))
-        return float(np.mean(clip_means(inside, test_clips)))
+        return float(np.mean(cluster_means(inside, test_clips)))
 
 
 def splits_by_style(distances: ForecastDistances) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -166,12 +166,12 @@ def stored_part(evaluation: Evaluation, run: Path | None) -> dict[str, Any]:
     rows = {
         name: {
             score: [float(f"{value:.4g}") for value in values]
-            for score, values in row.clip_means.items()
+            for score, values in row.cluster_means.items()
             if score in SHOWN
         }
         for name, row in evaluation.rows.items()
     }
-    result = {"basis": same(evaluation), "clips": evaluation.clips, "rows": rows, "minutes": 0.0, "config": {}}
+    result = {"basis": same(evaluation), "clips": evaluation.clusters, "rows": rows, "minutes": 0.0, "config": {}}
     if run is not None:
         fitted_run = Run(run)
         options = {name: value for name, value in fitted_run.config["method"].items() if not name.endswith("_run")}

@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from dvae.inference.diagnostics.checks import decode
 from dvae.inference.evaluation.estimates import TwoWayErrors
-from dvae.inference.evaluation.evaluation_windows import clip_index, on_device_of, seeded_evaluation
+from dvae.inference.evaluation.evaluation_windows import cluster_index, on_device_of, seeded_evaluation
 from dvae.motion import Windows
 from dvae.program.batch import rows
 
@@ -100,7 +100,7 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
     inferred, x = posterior_means(model, batch, seed), batch["x"]
     features = {name: value if value.dim() == 2 else value.mean(1) for name, value in inferred.items()}
     features["mean and spread of poses"] = torch.cat([x.mean(1), x.std(1)], 1)
-    places = clip_index(windows.keys)
+    places = cluster_index(windows.keys)
     lengths = windows.skeleton.bone_lengths(windows.positions(x)).mean(1).double()
     values_by_label = {label: windows.labels(label) for label in labels}
     lines = []
@@ -119,7 +119,7 @@ def probes(model: Any, windows: Windows, labels: Sequence[str], seed: int) -> li
 def format_accuracy(right: Tensor, places: Tensor) -> str:
     """Format the mean over windows with its standard error, clustered by clip."""
     _, clips = np.unique(places.numpy(), return_inverse=True)
-    estimate = TwoWayErrors.by_clip(right.numpy()[None], np.ones(len(clips)), clips).estimate()
+    estimate = TwoWayErrors.by_cluster(right.numpy()[None], np.ones(len(clips)), clips).estimate()
     return f"{estimate.mean:.3f} ± {estimate.sequences:.3f}"
 
 

@@ -13,7 +13,7 @@ import torch
 import tyro
 
 from dvae.inference.evaluation.estimates import TwoWayErrors
-from dvae.inference.evaluation.evaluation_windows import clip_index
+from dvae.inference.evaluation.evaluation_windows import cluster_index
 from dvae.models.motion.trajectories import Completion, TrajectoryModel
 
 from .ranking import JOINTS
@@ -49,7 +49,7 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
         sys.exit(str(error))
     indices = torch.linspace(0, len(windows) - 1, min(count, len(windows))).long()
     motions = windows.positions(windows.all()["x"][indices]).numpy()
-    _, clips = np.unique(clip_index(windows.keys)[indices].numpy(), return_inverse=True)
+    _, clips = np.unique(cluster_index(windows.keys)[indices].numpy(), return_inverse=True)
     rows = []
     for number, exact in product(range(1, len(joints) + 1), (False, True)):
         torch.manual_seed(0)
@@ -61,7 +61,8 @@ def exact_paths(folder: Path, joints: Sequence[str], count: int, samples: int) -
             values.append(measure_completion(completion, windows.skeleton.bone_lengths(motion[:1])))
         elapsed = (time.perf_counter() - start) / (len(motions) * samples)
         means = [
-            TwoWayErrors.by_clip(each[None], np.ones(len(motions)), clips).estimate() for each in np.transpose(values)
+            TwoWayErrors.by_cluster(each[None], np.ones(len(motions)), clips).estimate()
+            for each in np.transpose(values)
         ]
         formatted = [
             "–" if np.isnan(mean.mean) else f"{mean.mean:{form}} ± {mean.sequences:{form}}"

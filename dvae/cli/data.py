@@ -85,7 +85,7 @@ def convert(
     if files in ((), (SIMULATED,)):
         if metres or up or recorded:
             raise UsageError("--metres, --up and --recorded correct what files state; simulated motion has no files")
-        people = motion.simulate() if fps is None else motion.simulate().resampled(fps)
+        people = motion.simulate() if fps is None else motion.simulate().resample(fps)
         people = people if target is None else reading.select_joints(people, onto=target)
         description = f"{len(writing.write_motion(out, people, format))} files"
     else:

@@ -120,7 +120,7 @@ def _fans(by_name: Mapping[str, Any], windows: PanelWindows, count: int, samples
     if windows.length is None:
         text = "These runs were fitted on whole sequences. To see futures, fit with --observed and --horizon."
         return Section("Futures", before=missing_part(text))
-    selected = windows.some(sections.SelectedWindows(windows, count).chosen)
+    selected = windows.subset(sections.SelectedWindows(windows, count).chosen)
 
     def cell(run: runs.Loaded) -> Markup:
         forecasts = selected.forecast(run.model, max(samples, QUANTILES), seed)

@@ -82,7 +82,7 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
 
     @property
     def keys(self) -> Sequence[tuple[str, str, int]]:
-        """(split, clip, first frame) of every window."""
+        """(split, cluster, first step) of every window."""
 
     @property
     def description(self) -> Mapping[str, Any]:
@@ -91,22 +91,22 @@ class HeldOutWindows(Fingerprinted, Listed, Protocol):
         "title" lists phrases for titles. "columns" is a dictionary from the name of each coordinate of x, in order, to
         the unit that tables print, "" for none. To remove units from a coordinate, its entry of "means" is subtracted
         and the result is divided by its entry of "scales". "season" is the period of the data in steps, for a reference
-        row of the results. "called" is a list of the words for a cluster of windows and for a step, by default
+        row of the results. "axis_names" is a list of the words for a cluster of windows and for a step, by default
         ["sequence", "step"].
         """
 
 
-def clusters(windows: Any) -> list[tuple[str, str, int]]:
-    """Return the cluster of each window: `clusters` if the windows define it, otherwise `keys`, which give the clip.
+def cluster_keys(windows: Any) -> list[tuple[str, str, int]]:
+    """Return the cluster of each window: `cluster_keys` if the windows define them, else `keys`.
 
     Windows of different clusters are independent.
     """
-    return list(getattr(windows, "clusters", None) or windows.keys)
+    return list(getattr(windows, "cluster_keys", None) or windows.keys)
 
 
 def axis_names(metadata: Mapping[str, Any]) -> tuple[str, str]:
     """Return the words for a cluster of windows and for a step, from a description of windows or their defaults."""
-    cluster, step = metadata.get("called", ("sequence", "step"))
+    cluster, step = metadata.get("axis_names", ("sequence", "step"))
     return cluster, step
 
 
@@ -527,11 +527,11 @@ class ArrayWindows:
 
     @property
     def description(self) -> dict[str, Any]:
-        """The entries "columns", "season" and "called", each only if the windows have columns, a season or groups."""
+        """Entries "columns", "season" and "axis_names", each only if the windows have columns, a season or groups."""
         description: dict[str, Any] = {
             "columns": None if self.columns is None else dict(self.columns),
             "season": self.season,
-            "called": None if self.groups is None else ["group", "step"],
+            "axis_names": None if self.groups is None else ["group", "step"],
         }
         return {name: value for name, value in description.items() if value is not None}
 

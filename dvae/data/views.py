@@ -329,7 +329,9 @@ class Past(View):
             raise ValueError("a view with `Past` requires windows of one length; remove 'lengths' from the batch")
         x, masks, frames = data[WHOLE], data.masks(), self.frames
         if x.shape[1] < frames:
-            raise ValueError(f"this model requires at least {frames} observed steps, got {x.shape[1]}")
+            raise ValueError(
+                f"this model requires at least {frames} observed steps, got {x.shape[1]}; give longer sequences"
+            )
         for name in self.also:
             if name in data and data[name].shape[1] != x.shape[1] > frames:
                 raise ValueError(

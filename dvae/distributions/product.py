@@ -122,17 +122,17 @@ class ProductModule(ConditionalDistribution):
     def forward(self, features: Tensor, previous: Tensor | None = None, t: int | None = None) -> Parameters:
         return sum((self._part(n, features, previous, t) for n in range(len(self.parts))), ())
 
-    def each(self, parameters: Parameters) -> list[tuple[Any, list[int], Parameters]]:
+    def split(self, parameters: Parameters) -> list[tuple[Any, list[int], Parameters]]:
         """Return for each part its module, the indices of its coordinates, and its parameters.
 
         Args:
             parameters: result of `forward`.
         """
-        split, start = [], 0
+        parts, start = [], 0
         for count in self.counts:
-            split.append(parameters[start : start + count])
+            parts.append(parameters[start : start + count])
             start += count
-        return list(zip(self.parts, self.places, split, strict=True))
+        return list(zip(self.parts, self.places, parts, strict=True))
 
     def _concatenate(self, parts: list[Tensor]) -> Tensor:
         return torch.cat(parts, -1)[..., self.order]
@@ -140,17 +140,17 @@ class ProductModule(ConditionalDistribution):
     @override
     def distribution(self, parameters: Parameters) -> TorchDistribution:
         return ProductDistribution(
-            [(places, distribution.distribution(values)) for distribution, places, values in self.each(parameters)]
+            [(places, distribution.distribution(values)) for distribution, places, values in self.split(parameters)]
         )
 
     @override
     def mean(self, parameters: Parameters) -> Tensor:
-        return self._concatenate([distribution.mean(values) for distribution, _, values in self.each(parameters)])
+        return self._concatenate([distribution.mean(values) for distribution, _, values in self.split(parameters)])
 
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
         scale, rescaled = scale.expand_as(mean), ()
-        for distribution, places, values in self.each(parameters):
+        for distribution, places, values in self.split(parameters):
             rescaled += (
                 distribution.rescale(values, mean[places], scale[places]) if distribution.location_scale else values
             )
@@ -159,7 +159,7 @@ class ProductModule(ConditionalDistribution):
     @override
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         return self._concatenate(
-            [distribution.draw(values, noise[..., places]) for distribution, places, values in self.each(parameters)]
+            [distribution.draw(values, noise[..., places]) for distribution, places, values in self.split(parameters)]
         )
 
 

@@ -313,7 +313,7 @@ class Derived:
         order: drawing order of the latents.
         inference: factorization of the guide.
         edges: number of edges of the guide's graph, unrolled over `Alternatives.steps` steps.
-        looped: names of latents that are drawn step by step; the others are drawn at all steps at once.
+        sequential: names of latents that are drawn step by step; the others are drawn at all steps at once.
         sampled: names of latents whose KL term has no unbiased closed form under this guide (`analytic_kl`). The bound
             averages these terms over draws, which adds sampling noise.
     """
@@ -321,7 +321,7 @@ class Derived:
     order: Order
     inference: Factorization
     edges: int
-    looped: tuple[str, ...]
+    sequential: tuple[str, ...]
     sampled: tuple[str, ...]
 
 
@@ -343,7 +343,7 @@ class Alternatives(_TextTable):
         (4, 'q(w | x_{1:T}) q(z_t | z_{t-1}, x_{>=t}, w)')
     """
 
-    header = ("guide", "drawn", "edges", "looped", "KL by draws")
+    header = ("guide", "order", "edges", "sequential", "sampled KL")
 
     generative: Factorization
     guides: tuple[Derived, ...]
@@ -351,13 +351,13 @@ class Alternatives(_TextTable):
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
-        """Rows of text (guide, drawing order, edges, latents drawn in a loop, latents whose KL is sampled)."""
+        """Rows of text: guide, order of drawing, edges, latents drawn step by step, latents whose KL is sampled."""
         return [
             (
                 each.inference.text,
                 describe_order(each.order),
                 str(each.edges),
-                ", ".join(each.looped) or "-",
+                ", ".join(each.sequential) or "-",
                 ", ".join(each.sampled) or "-",
             )
             for each in self.guides
@@ -407,9 +407,9 @@ def alternatives(
 
     Example:
         >>> print(dvae.alternatives("p(z_t | z_{t-1}) p(x_t | z_t)"))
-        guide                      drawn       edges  looped  KL by draws
-        q(z_t | z_{t-1}, x_{>=t})  z forward   64     z       -
-        q(z_t | z_{t+1}, x_{<=t})  z backward  64     z       z
+        guide                      order       edges  sequential  sampled KL
+        q(z_t | z_{t-1}, x_{>=t})  z forward   64     z           -
+        q(z_t | z_{t+1}, x_{<=t})  z backward  64     z           z
         each reads what the posterior depends on in its order (see `faithful_inverse`); edges of 10 steps
     """
     generative, observed, summed = Factorization.parse(generative), tuple(observed), tuple(summed)
@@ -423,16 +423,16 @@ def alternatives(
                 f"{generative.text!r} has no latents, so no guide can be derived; give a model with a latent, such as "
                 "p(z_t | z_{t-1}) p(x_t | z_t)"
             )
-        looped = tuple(name for block in inference.blocks if block.direction for name in block.names)
+        sequential = tuple(name for block in inference.blocks if block.direction for name in block.names)
         closed = analytic_kl(generative, inference)
         closed |= {f.child: False for f in generative.factors if f.child in closed and any(map(f.parent, summed))}
         derived = Derived(
             order,
             inference,
             inference.dag(steps).number_of_edges(),
-            looped,
+            sequential,
             tuple(name for name, exact in closed.items() if not exact),
         )
         unique.setdefault(frozenset(inference.factors), derived)
-    guides = sorted(unique.values(), key=lambda each: (bool(each.looped), each.edges, len(each.sampled)))
+    guides = sorted(unique.values(), key=lambda each: (bool(each.sequential), each.edges, len(each.sampled)))
     return Alternatives(generative, tuple(guides), steps)

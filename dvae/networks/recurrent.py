@@ -454,11 +454,13 @@ def tie(first: Any, *others: Any) -> None:
 def _shape(network: Any) -> dict[str, Any]:
     """Return the properties that tied forward memories must share: parents, lags and parameter shapes."""
     if not isinstance(network, RecurrentNetwork):
-        raise ValueError(f"only recurrent networks can be tied, got a {type(network).__name__}")
+        raise ValueError(
+            f"only recurrent networks can be tied, got a {type(network).__name__}; give both networks as `Recurrent`"
+        )
     if network.past is None:
         raise ValueError(
             "only networks with exactly one forward memory can be tied, but this one reads no past, or has one memory "
-            "for each parent (separate=True)"
+            "for each parent; set separate=False, and let it read the past"
         )
     parts = {name: network.extractors[name] for name, _ in network.past.reads if name in network.extractors}
     shapes = {name: [tuple(p.shape) for p in part.parameters()] for name, part in parts.items()}

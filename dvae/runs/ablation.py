@@ -168,13 +168,13 @@ class Ablation(Result):
         if self.comparison is not None:
             lines += [
                 f"fitted: loss without the edge, for the model in the IWAE bound with K = {self.comparison.particles}, "
-                f"for the guide in the ELBO, in nats a {self._frame},",
-                "± standard errors over clips ± over seeds; 95 % from both; p: adjusted for all edges (Holm)",
+                f"for the guide in the ELBO, in nats a {self._axes[1]},",
+                f"± standard errors over {self._axes[0]}s ± over seeds; 95 % from both; p adjusted by Holm",
             ]
         table = Table(title=f"{self.generative.text}\n{self.inference.text}".strip(), caption="\n".join(lines))
-        columns = ("fitted", "95 %", "p") if self.comparison is not None else ()
-        for name in ("edge", "of", "surrogate", *columns, *(["note"] if self.notes else [])):
-            table.add_column(name, justify="right" if name in ("surrogate", *columns) else "left", overflow="fold")
+        columns = (f"fitted (nats/{self._axes[1]})", "95 %", "p") if self.comparison is not None else ()
+        for name in ("edge", "part", "surrogate (nats/sequence)", *columns, *(["note"] if self.notes else [])):
+            table.add_column(name, justify="right" if name not in ("edge", "part", "note") else "left", overflow="fold")
         for edge in self.edges:
             costs = np.array(self.costs[edge.run])
             cells = [f"{number(costs.mean())} ({number(costs.min())} to {number(costs.max())})"]
@@ -199,7 +199,7 @@ class Ablation(Result):
         if self.comparison is not None:
             measured = {run: estimate.mean for run, estimate in self.differences.items()}
             insignificant = {run for run, p in self.p_values.items() if not p < LEVEL}
-            rows.append((f"nats a {self._frame}, on data\n(pale: p ≥ {LEVEL})", measured, insignificant))
+            rows.append((f"nats a {self._axes[1]}, on data\n(pale: p ≥ {LEVEL})", measured, insignificant))
         figure = new_figure(3.5 * len(parts), 2.7 * len(rows))
         panels = figure.subplots(len(rows), len(parts), squeeze=False)
         for (unit, costs, pale), row in zip(rows, panels, strict=True):
@@ -213,9 +213,9 @@ class Ablation(Result):
         return figure
 
     @property
-    def _frame(self) -> str:
-        """Word for a time step in units of bounds, such as "frame" in nats per frame; "" without fits."""
-        return axis_names(self.comparison.data)[1] if self.comparison is not None else ""
+    def _axes(self) -> tuple[str, str]:
+        """Words for a cluster of sequences and for a step, such as "clip" and "frame", of the fitted models' data."""
+        return axis_names(self.comparison.data if self.comparison is not None else {})
 
     @property
     def observed(self) -> tuple[str, ...]:

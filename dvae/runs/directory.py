@@ -119,7 +119,7 @@ class Loaded:
         Raises:
             ValueError: the data have another schema, such as other joints.
         """
-        other = DATA[self.config.kind].reopened(replace(self.config.data, **changes), self.schema, path)
+        other = DATA[self.config.kind].reopen(replace(self.config.data, **changes), self.schema, path)
         stored, other_config = (dict(flat(schema.config())) for schema in (self.schema, other.schema))
         if differing := [name for name in stored | other_config if stored.get(name) != other_config.get(name)]:
             values = (f"{name} is {brief(other_config.get(name))}, not {brief(stored.get(name))}" for name in differing)

@@ -61,7 +61,7 @@ class Dataset(Protocol):
         """Return the source of the data, such as path and fingerprint, which `config.json` of a run stores."""
 
     @classmethod
-    def reopened(cls, source: Any, schema: Any, path: str | os.PathLike[str] | None = None) -> Self:
+    def reopen(cls, source: Any, schema: Any, path: str | os.PathLike[str] | None = None) -> Self:
         """Open recorded data from their own or another path, without checking their content."""
 
 
@@ -82,7 +82,7 @@ def open_data(
     """
     path = os.fspath(path or source.path)
     try:
-        data = DATA[kind].reopened(source, schema, path)
+        data = DATA[kind].reopen(source, schema, path)
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{run} was fitted on {source.path}, but {path} does not exist; relative paths start from the working "

@@ -104,7 +104,7 @@ class ColumnHints:
         """
         levels, frame = [name for name, _ in index_levels(frame)], tabular(frame)
         if not len(frame):
-            raise ValueError("the table has no rows")
+            raise ValueError("the table has a header but no rows; give a table with observations")
         available = list(frame.columns)
         roles: dict[str, tuple[Role, str]] = {}
         entries_by_role: dict[Role, tuple[str, ...]]

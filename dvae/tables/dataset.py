@@ -200,11 +200,11 @@ class PanelData:
         return self.schema.cut
 
     def recorded(self) -> PanelSource:
-        """Return the source of the data, for `reopened`."""
+        """Return the source of the data, for `reopen`."""
         return PanelSource(self.path, self.fingerprint)
 
     @classmethod
-    def reopened(cls, source: PanelSource, schema: PanelSchema, path: str | os.PathLike[str] | None = None) -> Self:
+    def reopen(cls, source: PanelSource, schema: PanelSchema, path: str | os.PathLike[str] | None = None) -> Self:
         """Read a recorded panel with the schema of the run, from its path or another one.
 
         The content may have changed.

@@ -383,7 +383,7 @@ def _split_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
             f"{' …' if len(available) > 20 else ''}"
         )
     if not len(frame):
-        raise ValueError("the table has no rows")
+        raise ValueError("the table has a header but no rows; give a table with observations")
     options = (columns.na_values, columns.decimal)
     values = np.stack([numeric(frame[column.name], column, *options) for column in columns.columns], 1)
     label_columns = {role: name for role in ("group", "split") if (name := getattr(columns, role))}

@@ -91,9 +91,9 @@ def _read_text(content: bytes, separators: str) -> Any:
     head = content[:LARGEST_HEADER].decode("utf-8", "replace")
     separator = max(separators, key=lambda candidate: len(_header(head, candidate)))
     if max(map(len, _rows(head, separator)), default=0) > MOST:
-        raise ValueError(f"it has more than {MOST} columns")
+        raise ValueError(f"it has more than {MOST} columns; remove some")
     if b"\0" in content:
-        raise ValueError("it has null bytes, which are not text")
+        raise ValueError("it has null bytes, which are not text; save it as CSV in UTF-8")
     read_csv = partial(pd.read_csv, sep=separator, index_col=False, dtype=str, keep_default_na=False, na_values=[""])
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)

@@ -158,7 +158,7 @@ class PanelWindows:
             )
 
     @property
-    def clusters(self) -> list[tuple[str, str, int]]:
+    def cluster_keys(self) -> list[tuple[str, str, int]]:
         """Keys by group instead of sequence if the data have groups, since sequences of a group are dependent."""
         if not self.schema.columns.group:
             return self.keys
@@ -174,7 +174,7 @@ class PanelWindows:
             "columns": columns,
             "means": [coordinate.mean for coordinate in coordinates],
             "scales": [coordinate.scale for coordinate in coordinates],
-            "called": ["group" if self.schema.columns.group else "sequence", "step"],
+            "axis_names": ["group" if self.schema.columns.group else "sequence", "step"],
         }
         entries |= {} if self.protocol.season is None else {"season": self.protocol.season}
         return {**entries, "title": [self.panel.name, self.split]}
@@ -226,16 +226,16 @@ class PanelWindows:
         low, last = self._low[indices], self._last[indices]
         return indices, low + (u_start * (last - low + 1)).long()
 
-    def some(self, places: Sequence[int]) -> Self:
+    def subset(self, places: Sequence[int]) -> Self:
         """Return some of the listed windows.
 
         Args:
             places: indices of the windows to keep.
         """
-        subset = copy(self)
+        selected = copy(self)
         ranges, starts = self._windows
-        subset._windows = ranges[list(places)], starts[list(places)]
-        return subset
+        selected._windows = ranges[list(places)], starts[list(places)]
+        return selected
 
     def all(self) -> Batch:
         """Return the listed windows, in the order of `keys`."""

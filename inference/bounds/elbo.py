@@ -41,7 +41,7 @@ class Terms:
             volume.
         kl: KL (B,) of each latent, summed over the steps of a local one.
         energies: energy (B,) of each penalty (a `pyro.factor` site), positive if it costs.
-        frames: number of valid steps, (B,).
+        n_steps: number of valid steps, (B,).
         steps: log-likelihood or KL by step (B, T) of each local variable, 0 at padding.
 
     Example:
@@ -54,7 +54,7 @@ class Terms:
     log_likelihood: dict[str, Tensor]
     kl: dict[str, Tensor]
     energies: dict[str, Tensor]
-    frames: Tensor
+    n_steps: Tensor
     steps: dict[str, Tensor] = field(default_factory=dict)
 
     @property
@@ -65,13 +65,13 @@ class Terms:
     @property
     def bound(self) -> Tensor:
         """Unweighted evidence lower bound, (B,), without energies."""
-        none = torch.zeros_like(self.frames)
+        none = torch.zeros_like(self.n_steps)
         return sum(self.log_likelihood.values(), none) - sum(self.kl.values(), none)
 
     @property
-    def per_frame(self) -> Tensor:
-        """Bound in nats per frame, (B,)."""
-        return self.bound / self.frames
+    def per_step(self) -> Tensor:
+        """Bound in nats per step, (B,)."""
+        return self.bound / self.n_steps
 
 
 class SequenceELBO(ELBO):
@@ -169,7 +169,7 @@ class SequenceELBO(ELBO):
         for name, site in model_sites.items():
             fn, value, run = site["fn"], site["value"], site["infer"].get("run")
             if run is not None:
-                terms.frames = _frames(run)
+                terms.n_steps = _valid_steps(run)
             if name == "log_det":
                 terms.log_likelihood[name] = fn.log_prob(value)
             elif isinstance(fn, Unit):
@@ -185,8 +185,8 @@ class SequenceELBO(ELBO):
                     f"the latent {name} is in the model but not in the guide; add a sample site {name} to the guide"
                 )
         values = [*terms.log_likelihood.values(), *terms.kl.values(), *terms.energies.values()]
-        if values and not len(terms.frames):  # no variable has steps, so each sequence counts once
-            terms.frames = torch.ones_like(values[0])
+        if values and not len(terms.n_steps):  # no variable has steps, so each sequence counts once
+            terms.n_steps = torch.ones_like(values[0])
         return terms
 
 
@@ -284,14 +284,14 @@ def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, ru
     if run is not None and run.draws > 1:
         value = value.unflatten(0, (run.draws, -1)).mean(0)
     if value.dim() == 2:
-        if not len(terms.frames):  # a custom program that does not give its length
-            terms.frames = value.new_full((len(value),), float(value.shape[1]))
+        if not len(terms.n_steps):  # a custom program that does not give its length
+            terms.n_steps = value.new_full((len(value),), float(value.shape[1]))
         terms.steps[name] = value
         value = value.sum(-1)
     table[name] = value
 
 
-def _frames(rollout: Rollout) -> Tensor:
+def _valid_steps(rollout: Rollout) -> Tensor:
     reference, rows = like(next(iter(rollout.conditionals.values()))), rollout.batch // rollout.draws
     if rollout.lengths is None:
         return reference.new_full((rows,), float(rollout.length))
@@ -304,7 +304,7 @@ def _mean(draws: list[Terms]) -> Terms:
 
     tables = zip(*((d.log_likelihood, d.kl, d.energies, d.steps) for d in draws), strict=True)
     likelihood, kl, energies, steps = map(average, tables)
-    return Terms(likelihood, kl, energies, draws[0].frames, steps)
+    return Terms(likelihood, kl, energies, draws[0].n_steps, steps)
 
 
 def require_likelihood(model: DynamicalVAE) -> None:

@@ -40,7 +40,7 @@ def predictive_bound(
     Args:
         model: model with its guide.
         batch: whole sequences (B, T, D), or a mapping with context over all T steps.
-        observed: O, number of observed frames.
+        observed: O, number of observed steps.
         particles: K, number of particles.
         chunk: largest number of sequences times particles in memory.
 
@@ -48,7 +48,7 @@ def predictive_bound(
         The bound in nats per sequence, and the tail shape of the weights, (B,) each.
 
     Raises:
-        ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no frame is
+        ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no step is
             left to observe or to predict.
     """
     require_likelihood(model)
@@ -59,7 +59,7 @@ def predictive_bound(
     with model.running():
         data = model.read(batch)
         size, length = data[model.observed[0]].shape[:2]
-        observed -= model.view.past  # the view's past frames are context, which is always given
+        observed -= model.view.past  # the view's past steps are context, which is always given
         if model.grouped and data.group is not None:
             raise ValueError(
                 f"groups share {', '.join(model.grouped)}, but a log score is of one sequence; remove 'group' from the "

@@ -40,14 +40,14 @@ def bounds(
         name: name of the model, for errors.
         model: model with its guide.
         batch: batch of all sequences.
-        keys: (split, clip, first frame) of each sequence, for errors.
+        keys: (split, cluster, first step) of each sequence, for errors.
         particles: K of the IWAE bound.
         estimates: E, number of independent IWAE estimates of every sequence.
         parts: slices of the sequences, evaluated one after another.
 
     Returns:
         "bounds": ELBO, IWAE bound, k-hat and KL of each latent by name, (N,) each, in nats per sequence. "kl_steps":
-        mean KL by step, (T,), of each local latent. "estimates": (E, N). "frames": numbers of valid frames (N,).
+        mean KL by step, (T,), of each local latent. "estimates": (E, N). "steps": numbers of valid steps (N,).
 
     Raises:
         FloatingPointError: when a bound is not finite.
@@ -66,10 +66,10 @@ def bounds(
         scores |= {f"KL {latent}": kl for latent, kl in terms.kl.items()}
         for latent in terms.kl.keys() & terms.steps.keys():
             steps[latent] = steps.get(latent, 0) + terms.steps[latent].double().sum(0)
-        scores |= {"estimates": values, "frames": terms.frames}
+        scores |= {"estimates": values, "steps": terms.n_steps}
         results.append({metric: value.double().cpu() for metric, value in scores.items()})
     merged = {metric: torch.cat([piece[metric] for piece in results], dim=-1) for metric in results[0]}
-    weighted, length = merged.pop("estimates"), merged.pop("frames")
+    weighted, length = merged.pop("estimates"), merged.pop("steps")
     return {
         "bounds": {metric: values.numpy() for metric, values in merged.items()},
         "kl_steps": {
@@ -77,7 +77,7 @@ def bounds(
             for latent, total in steps.items()
         },
         "estimates": weighted.numpy(),
-        "frames": length.numpy(),
+        "steps": length.numpy(),
     }
 
 
@@ -95,7 +95,7 @@ def filtered(
         name: name of the model, for errors.
         model: model with its guide.
         batch: batch of all N sequences.
-        keys: (split, clip, first frame) of each sequence, for errors.
+        keys: (split, cluster, first step) of each sequence, for errors.
         particles: K, number of particles.
         parts: slices of the sequences, evaluated one after another.
 

@@ -31,7 +31,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, Listed, axis_names, clusters, sequences, take_split
+from ...data.sequences import HeldOutWindows, Listed, axis_names, cluster_keys, sequences, take_split
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
 from ..bounds.annealing import annealed_bound
@@ -40,7 +40,7 @@ from ..bounds.particles import fivo_bound, obstacle
 from ..bounds.semi_amortized import missing_latents, require_local, semi_amortized_guide
 from ..bounds.teacher_forced import length_of
 from ..evaluation.estimates import Estimate, TwoWayErrors, decimals, number
-from ..evaluation.evaluation_windows import clip_index, on_device_of, refuse_non_finite, seeded_evaluation
+from ..evaluation.evaluation_windows import cluster_index, on_device_of, refuse_non_finite, seeded_evaluation
 from ..evaluation.record import Dims
 from ..evaluation.result import Result, Table, new_figure, progress_bar, styled
 
@@ -75,8 +75,8 @@ class Bracket(Result):
     Attributes:
         bounds: dictionary from "real" and "simulated" to {name of the bound: values (N,)}. "upper" exists only for
             simulated data, FIVO if the model allows it, and semi-amortized bounds if the guide is normal.
-        keys: (split, clip, first frame) of every sequence.
-        frames: number of frames of every sequence, real and simulated, (N,).
+        keys: (split, cluster, first step) of every sequence.
+        n_steps: number of steps of every sequence, real and simulated, (N,).
         equations: "generative" and "inference".
         added: for each latent, the additional parents of the guide with all edges.
         data: fingerprint and description of the windows.
@@ -97,7 +97,7 @@ class Bracket(Result):
 
     bounds: Annotated[dict[str, dict[str, np.ndarray]], Dims("sequence", name="{1} {0}")]
     keys: list[tuple[str, str, int]]
-    frames: Annotated[np.ndarray, Dims("sequence")]
+    n_steps: Annotated[np.ndarray, Dims("sequence")]
     equations: dict[str, str]
     added: dict[str, list[str]]
     data: dict[str, Any]
@@ -108,13 +108,13 @@ class Bracket(Result):
     seed: int
     notes: list[str]
 
-    def estimate(self, bound: str, above: str = "", data: str = "real", *, frame: bool = False) -> Estimate:
+    def estimate(self, bound: str, above: str = "", data: str = "real", *, per_step: bool = False) -> Estimate:
         """Return the mean of a bound, or of its difference to another one.
 
         Args:
             bound, above: names; with `above`, the result is `bound` minus `above`.
-            data: "real", with errors clustered by clip, or "simulated".
-            frame: whether to return nats per frame instead of per sequence.
+            data: "real", with clustered errors, or "simulated".
+            per_step: whether to return nats per step instead of per sequence.
 
         Returns:
             Mean with its standard error, in nats.
@@ -126,11 +126,11 @@ class Bracket(Result):
         if missing := [name for name in (bound, above) if name and name not in bounds]:
             raise KeyError(f"there is no bound {missing[0]!r} for {data} data; the bounds are {', '.join(bounds)}")
         values = bounds[bound] - (bounds[above] if above else 0.0)
-        weights = self.frames if frame else np.ones(len(values))
-        clips = clip_index(self.keys).numpy() if data == "real" else np.arange(len(values))
-        return TwoWayErrors.by_clip(values[None], weights, clips).estimate()
+        weights = self.n_steps if per_step else np.ones(len(values))
+        clusters = cluster_index(self.keys).numpy() if data == "real" else np.arange(len(values))
+        return TwoWayErrors.by_cluster(values[None], weights, clusters).estimate()
 
-    def gap(self, data: str = "real", *, frame: bool = False) -> dict[str, Estimate]:
+    def gap(self, data: str = "real", *, per_step: bool = False) -> dict[str, Estimate]:
         """Return the parts of the gap between ELBO and evidence by name, in nats per sequence.
 
         "family" is a lower limit, because it ends at the lower bound on the evidence. "unknown", for simulated data, is
@@ -138,29 +138,29 @@ class Bracket(Result):
 
         Args:
             data: "real" or "simulated".
-            frame: whether to return nats per frame instead of per sequence.
+            per_step: whether to return nats per step instead of per sequence.
         """
         bounds = self.bounds[data]
         parts = {name: ends for name, ends in PARTS.items() if all(end in bounds for end in ends)}
-        return {name: self.estimate(high, low, data, frame=frame) for name, (low, high) in parts.items()}
+        return {name: self.estimate(high, low, data, per_step=per_step) for name, (low, high) in parts.items()}
 
     def table(self) -> Group:
         """Return tables of bounds for real and simulated data, and of the parts of the gap."""
         return Group(*(self._bounds(data) for data in DATA), self._gap())
 
     def _bounds(self, data: str) -> Table:
-        clip, frame = axis_names(self.data)
-        counts = f"{len(self.keys)} sequences of {len({*clip_index(self.keys).tolist()})} {clip}s"
+        cluster, step = axis_names(self.data)
+        counts = f"{len(self.keys)} sequences of {len({*cluster_index(self.keys).tolist()})} {cluster}s"
         title = f"{self.equations['generative']}\n{self.equations['inference']}\n{counts}" if data == "real" else ""
-        caption = f"mean ± standard error over sequences{f', clustered by {clip}' if data == 'real' else ''}"
+        caption = f"mean ± standard error over sequences{f', clustered by {cluster}' if data == 'real' else ''}"
         table = Table(title=title, caption="\n".join([caption, *(self.notes if data == "real" else ())]))
         table.add_column(f"{data} data")
-        for column in ("nats a sequence", "above the ELBO", f"nats a {frame}"):
+        for column in ("nats a sequence", "above the ELBO", f"nats a {step}"):
             table.add_column(column, justify="right")
         for name in self.bounds[data]:
             above = "–" if name == "ELBO" else format_estimate(self.estimate(name, "ELBO", data))
-            total, per_frame = (format_estimate(self.estimate(name, data=data, frame=frame)) for frame in (False, True))
-            table.add_row(self._label(name), total, above, per_frame)
+            total, per_step = (format_estimate(self.estimate(name, data=data, per_step=each)) for each in (False, True))
+            table.add_row(self._label(name), total, above, per_step)
         return table
 
     def _label(self, name: str) -> str:
@@ -222,7 +222,7 @@ class Bracket(Result):
 
     @override
     def labels(self) -> dict[str, Sequence[str]]:
-        return {"sequence": [f"{split}/{clip} {start}" for split, clip, start in self.keys]}
+        return {"sequence": [f"{split}/{cluster} {start}" for split, cluster, start in self.keys]}
 
     @override
     def check(self) -> None:
@@ -233,7 +233,7 @@ class Bracket(Result):
             raise ValueError(f"unknown bounds {', '.join(sorted(unknown))}; expected some of {', '.join(BOUNDS)}")
         if self.extents != {"sequence": {len(self.keys)}} or not self.keys:
             raise ValueError(f"every bound must have one value for each of the {len(self.keys)} sequences in `keys`")
-        if not all(np.isfinite(values).all() for values in (self.frames, *real.values(), *simulated.values())):
+        if not all(np.isfinite(values).all() for values in (self.n_steps, *real.values(), *simulated.values())):
             raise ValueError("bounds and numbers of steps must be finite")
         if self.equations.keys() != {"generative", "inference"}:
             raise ValueError("equations must have the keys generative and inference")
@@ -318,7 +318,7 @@ def bracket(
         raise ValueError("sequences of a group have no separate evidence; remove 'group' from the batch")
     windows = data if isinstance(data, HeldOutWindows) else None
     size = length_of(all_rows)
-    keys = [("data", str(n), 0) for n in range(size)] if windows is None else clusters(windows)
+    keys = [("data", str(n), 0) for n in range(size)] if windows is None else cluster_keys(windows)
     generator = torch.Generator().manual_seed(seed)
     indices = torch.randperm(size, generator=generator)[:count]
     batch, keys = all_rows.rows(indices), [keys[n] for n in indices.tolist()]
@@ -360,7 +360,7 @@ def bracket(
             for name, all_ in results.items()
         },
         keys=keys,
-        frames=torch.cat([_frames(model, part) for part in batches]).double().cpu().numpy(),
+        n_steps=torch.cat([_valid_steps(model, part) for part in batches]).double().cpu().numpy(),
         equations={"generative": model.generative.text, "inference": model.inference.text},
         added={name: [term for parent in parents for term in parent.terms] for name, parents in added.items()},
         data={} if windows is None else {"fingerprint": windows.fingerprint, **_axis_words(windows)},
@@ -386,10 +386,10 @@ def _seeds(generator: torch.Generator, count: int) -> list[int]:
 
 
 def _axis_words(windows: HeldOutWindows) -> dict[str, Any]:
-    return {"called": list(axis_names(windows.description))} if "called" in windows.description else {}
+    return {"axis_names": list(axis_names(windows.description))} if "axis_names" in windows.description else {}
 
 
-def _frames(model: DynamicalVAE, data: Batch) -> Tensor:
+def _valid_steps(model: DynamicalVAE, data: Batch) -> Tensor:
     x: Tensor = data[model.observed[0]]
     return torch.full((len(x),), x.shape[1]) if data.lengths is None else data.lengths
 

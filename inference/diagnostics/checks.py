@@ -177,7 +177,7 @@ class Check:
         return float(scipy.stats.wasserstein_distance(self.real, self.replicated.ravel()))
 
 
-_SEAM = 2  # observed frames prepended to a forecast, so that statistics include a jump between them
+_SEAM = 2  # observed steps prepended to a forecast, so that statistics include a jump between them
 PROGRAMS = {
     "forecast": "free-running given what was observed",
     "posterior": "free-running given latents inferred from the whole window",
@@ -191,7 +191,7 @@ class PredictiveChecks(Result):
     Attributes:
         models: `Check` by model, program and statistic; programs are "forecast" and, for a model with latents,
             "posterior".
-        data: fingerprint, windows, frames, coordinates, and the windows' description.
+        data: fingerprint, windows, steps, coordinates, and the windows' description.
         protocol: fields of the windows' protocol.
         samples: S, number of replicates of each window.
         emission: "mean" or "drawn".
@@ -236,8 +236,8 @@ class PredictiveChecks(Result):
             *self.notes,
         ]
         table = Table(title=self._title, caption="\n".join(caption))
-        for column in ("", "", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
-            table.add_column(column, justify="right" if column else "left", no_wrap=True)
+        for column in ("statistic", "source", "5 %", "median", "95 %", "Wasserstein", "tail area", "outside"):
+            table.add_column(column, justify="left" if column in ("statistic", "source") else "right", no_wrap=True)
         for program in programs:
             table.add_section()
             table.add_row(Text(program, "bold"))
@@ -331,9 +331,9 @@ def predictive_checks(
 ) -> PredictiveChecks:
     """Replicate windows with one or several models, and compare statistics of real and replicated windows.
 
-    There are two kinds of replicates, both free-running. "forecast": the frames after the observed ones. The last two
-    observed frames are prepended, so that statistics include a jump between them. "posterior", the posterior predictive
-    distribution: latents are inferred from the whole window, and all its frames are generated from them. A model
+    There are two kinds of replicates, both free-running. "forecast": the steps after the observed ones. The last two
+    observed steps are prepended, so that statistics include a jump between them. "posterior", the posterior predictive
+    distribution: latents are inferred from the whole window, and all its steps are generated from them. A model
     without latents has no "posterior".
 
     Missing entries of a window are also missing in its replicates. A window with too few entries for a statistic is not
@@ -419,7 +419,7 @@ def predictive_checks(
 
 
 def _forecast(model: DynamicalVAE, batch: Batch, observed: int, samples: int, draw_emission: bool) -> Tensor:
-    """Return the last observed frames and the future, (S, B, seam + H, D)."""
+    """Return the last observed steps and the future, (S, B, seam + H, D)."""
     x = batch["x"]
     past, horizon = batch.past(observed), x.shape[1] - observed
     future = model.forecast(past, horizon, samples, draw_emission=draw_emission)["x"]
@@ -464,7 +464,7 @@ def decode(
 
     Args:
         model: model to run.
-        batch: batch with x, which determines B and T, and context. First frames of x that are context are kept.
+        batch: batch with x, which determines B and T, and context. First steps of x that are context are kept.
         latents: values of latents by name; all others are drawn from the model.
         mean_emission: whether x are means of the emission instead of draws.
     """

@@ -162,13 +162,13 @@ class ReferencePosterior(Result):
         return self.ratio * np.hypot(*each)  # type: ignore[no-any-return]
 
     @property
-    def lack(self) -> np.ndarray:
+    def correlation_difference(self) -> np.ndarray:
         """Difference of the correlations of reference and guide, (S, Q, Q)."""
         return self.reference.correlation - self.guide.correlation  # type: ignore[no-any-return]
 
     @property
-    def lack_error(self) -> np.ndarray:
-        """Monte Carlo standard error of `lack`, (S, Q, Q)."""
+    def correlation_difference_error(self) -> np.ndarray:
+        """Monte Carlo standard error of `correlation_difference`, (S, Q, Q)."""
         return np.hypot(self.guide.correlation_error, self.reference.correlation_error)  # type: ignore[no-any-return]
 
     @property
@@ -176,7 +176,7 @@ class ReferencePosterior(Result):
         """Masks (Q, Q) of pairs of numbers by kind, such as "z, between steps" or "w with z"; each pair occurs once."""
         latent, step, _ = self._places
         valid, same_step = (
-            np.isfinite(self.lack).any(0) & np.tri(len(latent), k=-1, dtype=bool).T,
+            np.isfinite(self.correlation_difference).any(0) & np.tri(len(latent), k=-1, dtype=bool).T,
             np.equal.outer(step, step),
         )
         masks = {}
@@ -206,8 +206,8 @@ class ReferencePosterior(Result):
         moments = Table(
             title=title, caption="bias in standard deviations of the reference; noise: its Monte Carlo error"
         )
-        for column in ("latent", "bias (rms)", "noise (rms)", "largest", "at", "deviation / reference"):
-            moments.add_column(column, justify="left" if column in ("latent", "at") else "right", no_wrap=True)
+        for column in ("latent", "bias (rms)", "noise (rms)", "largest bias", "number", "deviation / reference"):
+            moments.add_column(column, justify="left" if column in ("latent", "number") else "right", no_wrap=True)
         for place, name in enumerate(self.shapes):
             mask = self._places[0] == place
             bias, ratio = np.where(mask, self.bias, np.nan), np.log(self.ratio[:, mask])
@@ -216,12 +216,20 @@ class ReferencePosterior(Result):
             numbers = f"{_rms(bias):.3f}", f"{_rms(self.bias_error[:, mask]):.3f}", f"{bias[worst]:+.2f}"
             moments.add_row(name, *numbers, self._label(*map(int, worst)), f"{mean} ({least} to {most})")
         correlations = Table(title="correlations", caption=self.verdict)
-        for column in ("of", "pairs", "reference (rms)", "guide (rms)", "largest difference", "reference", "guide"):
+        for column in (
+            "correlations",
+            "pairs",
+            "reference (rms)",
+            "guide (rms)",
+            "largest difference",
+            "reference",
+            "guide",
+        ):
             correlations.add_column(
-                column, justify="left" if column in ("of", "largest difference") else "right", no_wrap=True
+                column, justify="left" if column in ("correlations", "largest difference") else "right", no_wrap=True
             )
         for kind, pairs in self.pairs.items():
-            lack = np.where(pairs, abs(self.lack), np.nan)
+            lack = np.where(pairs, abs(self.correlation_difference), np.nan)
             sequence, one, other = np.unravel_index(np.nanargmax(lack), lack.shape)
             both = [part.correlation for part in (self.reference, self.guide)]
             error = self.reference.correlation_error[sequence, one, other]
@@ -393,7 +401,7 @@ def reference_posterior(
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
         >>> model = dvae.linear_gaussian_surrogate(*pair, {"z": 1, "x": 2}, 4)
         >>> result = dvae.reference_posterior(model, model.sample(3, 4)["x"], sequences=[0, 2])
-        >>> result.exact, result.bias.shape, result.lack.shape
+        >>> result.exact, result.bias.shape, result.correlation_difference.shape
         (True, (2, 4), (2, 4, 4))
     """
     if min(draws, guide_draws) < 4 or chains < 2 or warmup < 1:  # arviz needs as many for R-hat

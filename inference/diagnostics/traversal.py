@@ -24,7 +24,7 @@ class Traversal:
         coordinates: indices of the C coordinates, which are shifted one at a time.
         offsets: offsets (M,) in units of `scale`; 0 is the inferred latent.
         scale: standard deviation of each coordinate under the prior or the posterior, (C,).
-        frames: decoded x, (C, M, B, T, D).
+        decoded: decoded x, (C, M, B, T, D).
         unit: "prior" or "posterior".
     """
 
@@ -32,13 +32,13 @@ class Traversal:
     coordinates: tuple[int, ...]
     offsets: Tensor
     scale: Tensor
-    frames: Tensor
+    decoded: Tensor
     unit: str
 
     @property
     def effect(self) -> Tensor:
         """Standard deviation of x over offsets, as a root mean square over sequences, steps and dimensions, (C,)."""
-        return self.frames.var(1, correction=0).mean((1, 2, 3)).sqrt()
+        return self.decoded.var(1, correction=0).mean((1, 2, 3)).sqrt()
 
 
 @torch.no_grad()
@@ -114,7 +114,7 @@ def traverse(
         inferred = model.guide(data)
         offsets = offsets.to(scale)
         fixed = {name: value for name, value in inferred.items() if name not in (*free, latent)}
-        frames = []
+        decoded = []
         for coordinate, unit_scale in zip(indices, scale, strict=True):
             shifted = repeat(inferred[latent], steps).unflatten(0, (steps, -1))
             shifted[..., coordinate] += (offsets * unit_scale).reshape(steps, *[1] * (shifted.dim() - 2))
@@ -122,9 +122,9 @@ def traverse(
             for group in shifted.split(1 if free else steps):
                 torch.manual_seed(seed)
                 latents = {**repeat(fixed, len(group)), latent: group.flatten(0, 1)}
-                frames.append(decode(model, repeat(data, len(group)), latents, True))
+                decoded.append(decode(model, repeat(data, len(group)), latents, True))
     shape = (len(indices), steps, -1)
-    return Traversal(latent, indices, offsets.cpu(), scale.cpu(), torch.cat(frames).unflatten(0, shape).cpu(), unit)
+    return Traversal(latent, indices, offsets.cpu(), scale.cpu(), torch.cat(decoded).unflatten(0, shape).cpu(), unit)
 
 
 def _check_path(model: DynamicalVAE, latent: str, free: Sequence[str]) -> None:

@@ -2,7 +2,7 @@
 
 Every model is scored teacher-forced on the same sequences: evidence lower bound, IWAE bound with the Pareto diagnostic
 of its weights, optionally the FIVO bound, KL of every latent, and information of the latents about the data.
-Free-running scores come from `evaluate`. Models are ranked by the IWAE bound per frame. `comparison` computes the
+Free-running scores come from `evaluate`. Models are ranked by the IWAE bound per step. `comparison` computes the
 uncertainty of their differences.
 """
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, Listed, axis_names, clusters, sequences, take_split
+from ...data.sequences import HeldOutWindows, Listed, axis_names, cluster_keys, sequences, take_split
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..bounds.particles import obstacle
@@ -72,7 +72,7 @@ def compare(
     is I(x; z_t). If q reads other latents too, it is the information that x adds to them. The contrasts are not
     weighted by how well they explain the past of the latents. It is therefore at least I(x; z_t | past), by the
     divergence of the two mixtures, and does not vanish when the past already identifies the sequence. If overlapping
-    windows of one clip are among the contrasts, nothing distinguishes their common part, and the information stays
+    windows of one cluster are among the contrasts, nothing distinguishes their common part, and the information stays
     below log M.
 
     Args:
@@ -132,7 +132,7 @@ def compare(
         )
     batch = sequences(data).batch
     sequence_ids = batch.group.tolist() if batch.group is not None else range(length_of(batch))
-    keys = [("data", str(n), 0) for n in sequence_ids] if windows is None else clusters(windows)
+    keys = [("data", str(n), 0) for n in sequence_ids] if windows is None else cluster_keys(windows)
     contrast_indices = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]
     shared: dict[str, Any] = {"seed": seed, "batch_size": batch_size, "progress": progress}
     free_running: dict[str, dict[str, Any]] = {label: {} for label in labelled}
@@ -144,7 +144,8 @@ def compare(
         evaluation = evaluate(labelled, windows, scores=lambda _: measures, **forecast_options, **shared)
         emission = evaluation.emission
         free_running = {
-            label: {m.name: np.array(evaluation.rows[label].clip_means[m.name]) for m in measures} for label in labelled
+            label: {m.name: np.array(evaluation.rows[label].cluster_means[m.name]) for m in measures}
+            for label in labelled
         }
     measured = {
         label: _score_model(
@@ -161,14 +162,16 @@ def compare(
     return Comparison(
         rows=rows,
         keys=keys,
-        frames=next(iter(measured.values()))["frames"],
+        n_steps=next(iter(measured.values()))["steps"],
         data={
             "fingerprint": windows.fingerprint if windows is not None else _fingerprint(batch),
             "sequences": len(keys),
-            "frames": x.shape[1],
+            "steps": x.shape[1],
             "coordinates": x.shape[2],
             **(
-                {"called": list(axis_names(windows.description))} if windows and "called" in windows.description else {}
+                {"axis_names": list(axis_names(windows.description))}
+                if windows and "axis_names" in windows.description
+                else {}
             ),
         },
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
@@ -226,7 +229,7 @@ def _score_model(
 
 def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> ModelResult:
     """Return one model's row of the comparison from the scores of all its seeds; `model` is the model of any seed."""
-    excluded = {"frames", "notes"}
+    excluded = {"steps", "notes"}
     scores = _stack([{key: value for key, value in seed.items() if key not in excluded} for seed in seeds])
     equations = {"generative": model.generative.text, "inference": model.inference.text}
     return ModelResult(

@@ -19,7 +19,7 @@ from ...options import nearest
 from ..bounds.elbo import KHAT_PARTICLES
 from .estimates import Estimate, TwoWayErrors, number
 from .evaluation import ARROWS
-from .evaluation_windows import clip_index
+from .evaluation_windows import cluster_index
 from .multiple_comparisons import ConfidenceSet, Pairs, Requirement, confidence_set, pairs, required
 from .record import MODELS, Dims
 from .result import Result, Table, literal_text, new_figure, styled
@@ -42,7 +42,7 @@ _LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and n
 
 @dataclass(frozen=True, eq=False)
 class ModelResult:
-    """Scores of one model, for S seeds, N sequences in C clips, T steps.
+    """Scores of one model, for S seeds, N sequences in C clusters, T steps.
 
     Args:
         equations: "generative" and "inference".
@@ -53,7 +53,7 @@ class ModelResult:
         variances: variance over the data of each coordinate's posterior mean, (S, D), of each latent.
         information: information of each latent, (S, T) in nats per step, or (S, 1) in nats per sequence if static.
         estimates: independent IWAE bounds in nats per sequence, (E, N), each the mean over seeds.
-        free_running: mean of each metric over the windows of each clip, (S, C).
+        free_running: mean of each metric over the windows of each cluster, (S, C).
         notes: requested scores that are not available, with reasons.
     """
 
@@ -64,7 +64,7 @@ class ModelResult:
     variances: Annotated[dict[str, np.ndarray], Dims("seed", "column", name="variance of mean {}")]
     information: Annotated[dict[str, np.ndarray], Dims("seed", "step", name="information of {}")]
     estimates: Annotated[np.ndarray, Dims("estimate", "sequence", name="estimates")]
-    free_running: Annotated[dict[str, np.ndarray], Dims("seed", "clip", name="{}")]
+    free_running: Annotated[dict[str, np.ndarray], Dims("seed", "cluster", name="{}")]
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -96,13 +96,13 @@ class ModelResult:
 class Comparison(Result):
     """Scores of several models on the same sequences, with the settings of the measurement.
 
-    Indexing returns the estimates of a model: `comparison["srnn"]["IWAE bound"].mean`, in nats per frame.
+    Indexing returns the estimates of a model: `comparison["srnn"]["IWAE bound"].mean`, in nats per step.
 
     Attributes:
         rows: `{name: ModelResult}`.
-        keys: (split, clip, first frame) of every sequence.
-        frames: number of frames of every sequence, (N,).
-        data: fingerprint (of windows), sequences, frames and coordinates.
+        keys: (split, cluster, first step) of every sequence.
+        n_steps: number of steps of every sequence, (N,).
+        data: fingerprint (of windows), sequences, steps and coordinates.
         protocol: fields of the windows' protocol; empty for tensors.
         particles: K of the IWAE bound.
         contrasts: M, number of sequences among which information was measured; its upper limit is log M.
@@ -125,7 +125,7 @@ class Comparison(Result):
 
     rows: Annotated[dict[str, ModelResult], MODELS]
     keys: list[tuple[str, str, int]]
-    frames: Annotated[np.ndarray, Dims("sequence")]
+    n_steps: Annotated[np.ndarray, Dims("sequence")]
     data: dict[str, Any]
     protocol: dict[str, Any]
     particles: int
@@ -145,7 +145,7 @@ class Comparison(Result):
 
     @property
     def ranking(self) -> list[str]:
-        """Names in the order of the IWAE bound per frame, the best first."""
+        """Names in the order of the IWAE bound per step, the best first."""
         return sorted(self.rows, key=lambda name: -self[name]["IWAE bound"].mean)
 
     def difference(self, first: str, second: str, metric: str = "IWAE bound") -> Estimate:
@@ -153,7 +153,7 @@ class Comparison(Result):
 
         Args:
             first, second: names of the models.
-            metric: name of the score, such as "IWAE bound" (nats per frame).
+            metric: name of the score, such as "IWAE bound" (nats per step).
 
         Raises:
             KeyError: when a model was not compared, or one of the two has no such metric.
@@ -186,13 +186,13 @@ class Comparison(Result):
 
         Raises:
             KeyError: when a model has no such metric.
-            ValueError: when a model has one seed, so that no error over seeds exists, or there is one clip.
+            ValueError: when a model has one seed, so that no error over seeds exists, or there is one cluster.
         """
         better = self.better.get(metric, "lower") if metric in self.shown else "higher"
         return confidence_set(self._all(metric), better, level, over_seeds=over_seeds)
 
     def required(self, first: str, second: str, metric: str = "IWAE bound", **options: Any) -> Requirement:
-        """Return how many training seeds and clips would distinguish two models.
+        """Return how many training seeds and clusters would distinguish two models.
 
         Args:
             first, second: names of two models with at least two seeds each.
@@ -217,7 +217,7 @@ class Comparison(Result):
         Raises:
             ValueError: when sequences or settings differ, or both have a model of the same name.
         """
-        settings, other_settings = ({**vars(each), "rows": None, "frames": None} for each in (self, other))
+        settings, other_settings = ({**vars(each), "rows": None, "n_steps": None} for each in (self, other))
         if different := [name for name, value in settings.items() if value != other_settings[name]]:
             raise ValueError(
                 f"comparisons to join may differ only in their models, but differ in {', '.join(different)}"
@@ -263,8 +263,8 @@ class Comparison(Result):
                 panel.plot(estimate.mean, place, "o", color=colours[name], label=labels[name])
             panel.set_ylim(len(ranking) - 0.5, -0.5)
             panel.set_yticks(range(len(ranking)), labels.values(), parse_math=False)
-            unit, _, frame = self._words
-            panel.set_xlabel(f"nats a {frame}; 95 % intervals over\n{unit}s (thick), also seeds (thin)")
+            unit, _, step = self._words
+            panel.set_xlabel(f"nats a {step}; 95 % intervals over\n{unit}s (thick), also seeds (thin)")
             panel.grid(axis="x", alpha=0.3)
         for place, name in enumerate(ranking):
             if "FIVO bound" in self.rows[name].bounds:
@@ -318,7 +318,7 @@ class Comparison(Result):
         The group `log_likelihood` contains independent IWAE estimates of every sequence's log evidence, as draws of one
         chain. A row of several seeds has the mean over its seeds, which is the score of a typical run. (Seeds as draws
         would be a mixture of runs, whose harmonic mean is dominated by the worst of them.) `constant_data` contains
-        ELBO, IWAE bound and k-hat by seed, and frames and clip of every sequence.
+        ELBO, IWAE bound and k-hat by seed, and steps and cluster of every sequence.
 
         The results of `loo` have another meaning here. The sequences are held out already, so its elpd is the held-out
         log evidence. Its p ("effective parameters") measures how much the independent estimates differ, in nats; it is
@@ -327,7 +327,7 @@ class Comparison(Result):
 
         Its k-hat describes the weights of the harmonic mean. It warns if estimates of a sequence differ by a nat or
         more, and nearly always with fewer than 200 draws. Its standard errors assume independent sequences and ignore
-        seeds; the standard errors of `difference` are clustered by clip.
+        seeds; the standard errors of `difference` are clustered.
 
         Raises:
             ValueError: when there are fewer than 25 estimates, too few for `loo` to smooth.
@@ -349,12 +349,12 @@ class Comparison(Result):
                 {
                     "posterior": {"log_evidence": likelihood.sum(-1)},
                     "log_likelihood": {"x": likelihood},
-                    "constant_data": {**constant, "frames": self.frames, "clip": np.array(self._clips)},
+                    "constant_data": {**constant, "steps": self.n_steps, "cluster": np.array(self._clusters)},
                 },
                 dims={
                     "x": ["sequence"],
-                    "frames": ["sequence"],
-                    "clip": ["sequence"],
+                    "steps": ["sequence"],
+                    "cluster": ["sequence"],
                     **{key: ["seed", "sequence"] for key in by_seed},
                 },
                 attrs={"/": {"particles": self.particles, "data": json.dumps(self.data), "seed": self.seed}},
@@ -378,7 +378,9 @@ class Comparison(Result):
 
     @override
     def labels(self) -> dict[str, Sequence[str]]:
-        return {"sequence": [f"{clip} {start}" for clip, (_, _, start) in zip(self._clips, self.keys, strict=True)]}
+        return {
+            "sequence": [f"{cluster} {start}" for cluster, (_, _, start) in zip(self._clusters, self.keys, strict=True)]
+        }
 
     @override
     def check(self) -> None:
@@ -403,44 +405,44 @@ class Comparison(Result):
         return self.rows[name]
 
     @property
-    def _clips(self) -> list[str]:
-        return [f"{split}/{clip}" for split, clip, _ in self.keys]
+    def _clusters(self) -> list[str]:
+        return [f"{split}/{cluster}" for split, cluster, _ in self.keys]
 
     def _parts(self, name: str, metric: str) -> TwoWayErrors:
         row = self._row(name)
         if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
             names = [each for each in (*row.bounds, *row.free_running) if each != "k-hat"]
             raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, names)}; it has {', '.join(names)}")
-        places = clip_index(self.keys).numpy()
+        places = cluster_index(self.keys).numpy()
         if metric in row.free_running:
-            return TwoWayErrors.of(row.free_running[metric], np.bincount(places, weights=self.frames))
-        return TwoWayErrors.by_clip(row.bounds[metric], self.frames, places)
+            return TwoWayErrors.of(row.free_running[metric], np.bincount(places, weights=self.n_steps))
+        return TwoWayErrors.by_cluster(row.bounds[metric], self.n_steps, places)
 
     # Tables
 
     @property
     def _words(self) -> tuple[str, str, str]:
         """Words for a scored sequence, for a cluster, and for a step."""
-        clip, frame = axis_names(self.data)
+        cluster, step = axis_names(self.data)
         if self.protocol.get("observed", 0) is None:
-            return "whole sequence", clip, frame
-        return "window" if "called" in self.data and clip != "clip" else "sequence", clip, frame
+            return "whole sequence", cluster, step
+        return "window" if "axis_names" in self.data and cluster != "clip" else "sequence", cluster, step
 
     def _title(self) -> str:
-        unit, clip, _ = self._words
+        unit, cluster, _ = self._words
         parts = [str(self.protocol.get("name", "")), f"{len(self.keys)} {unit}s"]
-        parts[-1] += "" if unit.endswith(clip) else f" of {len(set(self._clips))} {clip}s"
+        parts[-1] += "" if unit.endswith(cluster) else f" of {len(set(self._clusters))} {cluster}s"
         parts += [f"seed {self.seed}"]
         parts += [f"data {self.data['fingerprint'][:12]}"] if "fingerprint" in self.data else []
         return " · ".join(part for part in parts if part)
 
     def _bound_table(self) -> Table:
-        unit, clip, frame = self._words
-        clustered = "" if unit.endswith(clip) else f" (clustered by {clip})"
+        unit, cluster, step = self._words
+        clustered = "" if unit.endswith(cluster) else f" (clustered by {cluster})"
         bounds = (f"IWAE bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
         filters = [f"FIVO bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
         table = _table(
-            f"{self._title()}\nteacher-forced, nats a {frame}",
+            f"{self._title()}\nteacher-forced, nats a {step}",
             "\n".join(
                 [
                     f"mean ± standard error over {unit}s{clustered} ± over seeds",
@@ -490,7 +492,7 @@ class Comparison(Result):
         steps = row.information[latent].mean(0)
         if latent not in row.kl_steps:
             return f"{number(steps[0])} a sequence"
-        weights = (self.frames[:, None] > np.arange(len(steps))).sum(0)
+        weights = (self.n_steps[:, None] > np.arange(len(steps))).sum(0)
         return f"{number((weights * steps).sum() / weights.sum())} a step"
 
     def _free_running_table(self) -> Table:

@@ -9,11 +9,12 @@ simultaneously contains
     a step                  s = max over d                   a factor for each step
     the whole future        s = max over t and d             one factor
 
-Windows of a clip depend on each other; clips are exchangeable. The quantile is from hierarchical conformal prediction
-(Lee, Barber and Willett 2023, arXiv 2306.06342; groups as in Dunn, Wasserman and Ramdas 2018, arXiv 1809.07441). Each
-of C clips has the weight 1 / (C + 1), which its windows share, and the same weight is at infinity. The band contains
-the future of a window drawn from a new clip with probability `level` at least. For clips of one window each, q is the
-⌈(C + 1) level⌉-th smallest distance, and without ties the probability is level + 1 / (C + 1) at most.
+Windows of a cluster depend on each other; clusters are exchangeable. The quantile is from hierarchical conformal
+prediction (Lee, Barber and Willett 2023, arXiv 2306.06342; groups as in Dunn, Wasserman and Ramdas 2018, arXiv
+1809.07441). Each of C clusters has the weight 1 / (C + 1), which its windows share, and the same weight is at infinity.
+The band contains the future of a window drawn from a new cluster with probability `level` at least. For clusters of one
+window each, q is the ⌈(C + 1) level⌉-th smallest distance, and without ties the probability is level + 1 / (C + 1) at
+most.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from ...data.sequences import HeldOutWindows, axis_names, clusters, columns_of, mean_of_known, scales_of
+from ...data.sequences import HeldOutWindows, axis_names, cluster_keys, columns_of, mean_of_known, scales_of
 from ...options import nearest
 from .evaluate import evaluate, forecaster_of, forecasts_of
 from .evaluation import Evaluation
-from .evaluation_windows import EvaluationWindows, clip_index, prepare_windows, seeded_evaluation
+from .evaluation_windows import EvaluationWindows, cluster_index, prepare_windows, seeded_evaluation
 from .record import Dims
 from .references import References
 from .result import Result, Table, new_figure, progress_bar, styled
-from .scores import Measure, clip_means
+from .scores import Measure, cluster_means
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +60,7 @@ class PredictionBands(Result):
         samples: K, number of forecasts of a window.
         seed: seed of their draws.
         options: further arguments of the model's `forecast`.
-        clips: C, number of exchangeable clips among the calibration windows.
+        clusters: C, number of exchangeable clusters among the calibration windows.
         data: description of these windows.
 
     Example:
@@ -77,7 +78,7 @@ class PredictionBands(Result):
     samples: int
     seed: int
     options: Mapping[str, Any]
-    clips: int
+    clusters: int
     data: Mapping[str, Any]
 
     def apply(self, forecasts: Tensor, region: str = "future") -> tuple[Tensor, Tensor]:
@@ -146,7 +147,7 @@ class PredictionBands(Result):
                 lambda forecasts, truth, past, index: coverage_and_width(forecasts, truth)[kind, region][place],
                 in_unit,
                 better="",
-                pool=clips_alike,
+                pool=equally_weighted_clusters,
                 least=least[kind],
                 of_draws=True,
                 note="raw: quantiles of the forecasts; calibrated: conformal bands. Sequences have equal weight",
@@ -164,7 +165,7 @@ class PredictionBands(Result):
     ) -> Evaluation:
         """Return how often bands contain the future of other windows, before and after recalibration.
 
-        Errors are clustered by clip.
+        Errors are clustered.
 
         Args:
             model: model whose forecasts were calibrated, or the name of a reference.
@@ -191,15 +192,15 @@ class PredictionBands(Result):
 
     def table(self) -> Table:
         """Return a table of factors: mean over steps and coordinates, smallest and largest."""
-        clip, frame = axis_names(self.data)
-        title = f"bands of {100 * self.level:g} % · {self.data['windows']} windows of {self.clips} {clip}s"
+        cluster, step = axis_names(self.data)
+        title = f"bands of {100 * self.level:g} % · {self.data['windows']} windows of {self.clusters} {cluster}s"
         table = Table(
             title=title,
             caption=f"factor: half the width of a band divided by the spread of forecasts, K = {self.samples}",
         )
         for column in ("region", "factor", "smallest", "largest"):
             table.add_column(column, justify="left" if column == "region" else "right")
-        region_labels = {"number": "each number", "step": f"each {frame}", "future": "the whole future"}
+        region_labels = {"number": "each number", "step": f"each {step}", "future": "the whole future"}
         for region, factor in self.factors.items():
             table.add_row(
                 region_labels[region], *(f"{value:.2f}" for value in (factor.mean(), factor.min(), factor.max()))
@@ -260,19 +261,19 @@ def conformal_bands(
 ) -> PredictionBands:
     """Calibrate prediction bands around forecasts on windows that the model was not fitted to.
 
-    The bands contain the future of new windows with probability `level` if their clips are exchangeable with the
-    calibration clips, for example if both are of the same people and styles. Calibration on clips of one person or
-    style gives no guarantee for another. Later steps of the same sequences are not exchangeable with earlier ones, so
-    windows divided by time are refused.
+    The bands contain the future of new windows with probability `level` if their clusters are exchangeable with the
+    calibration clusters, for example if both are of the same people and styles. Calibration on clusters of one person
+    or style gives no guarantee for another. Later steps of the same sequences are not exchangeable with earlier ones,
+    so windows divided by time are refused.
 
     Args:
         model: a model (`Forecasting`), or the name of a reference row (`References`).
         windows: calibration windows.
         level: share of windows to contain, between 0 and 1.
-        groups: name of the exchangeable group of each window, if groups are larger than clips, such as its style. A
+        groups: name of the exchangeable group of each window, if groups are larger than clusters, such as its style. A
             level of 0.9 needs at least 9 groups.
         residuals: windows, such as training windows, on which the errors of the mean forecast are computed. The root
-            mean square of these errors, for each frame and coordinate, replaces the standard deviation of the forecasts
+            mean square of these errors, for each step and coordinate, replaces the standard deviation of the forecasts
             as spread. Use it for point forecasts, or if the standard deviation is a bad measure of the errors.
         samples: K, number of drawn forecasts of a window.
         training_windows: training data of "climatology" and "nearest neighbours".
@@ -286,7 +287,7 @@ def conformal_bands(
         `PredictionBands.scores` evaluates the coverage on other windows.
 
     Raises:
-        ValueError: when the level is invalid or needs more clips, forecasts have no spread, or `groups` and windows
+        ValueError: when the level is invalid or needs more clusters, forecasts have no spread, or `groups` and windows
             differ in number. Also when windows cannot be forecast, or are part of a split by time.
 
     Example:
@@ -297,25 +298,25 @@ def conformal_bands(
         {'number': (4, 2), 'step': (4, 1), 'future': (1, 1)}
     """
     eval_windows = prepare_windows(windows)
-    windows, (clip, _) = eval_windows.windows, axis_names(eval_windows.windows.description)
+    windows, (cluster, _) = eval_windows.windows, axis_names(eval_windows.windows.description)
     parts = {split for split, _, _ in eval_windows.keys} - {"all", "last"}
     if parts and getattr(windows.protocol, "split", None) == "time":
         raise ValueError(
-            f"these windows are the {' and '.join(sorted(parts))} part of {clip}s divided by time (split='time'). "
-            f"Prediction bands have their nominal coverage for the future of other {clip}s, and less for later steps "
-            f"of the same ones. Divide whole {clip}s by split='sequence' or 'group', or calibrate on all windows of "
-            f"other {clip}s, data.windows('all')"
+            f"these windows are the {' and '.join(sorted(parts))} part of {cluster}s divided by time (split='time'). "
+            f"Prediction bands have their nominal coverage for the future of other {cluster}s, and less for later "
+            f"steps of the same ones. Divide whole {cluster}s by split='sequence' or 'group', or calibrate on all "
+            f"windows of other {cluster}s, data.windows('all')"
         )
-    keys = clusters(windows) if groups is None else [("", group, 0) for group in groups]
+    keys = cluster_keys(windows) if groups is None else [("", group, 0) for group in groups]
     if len(keys) != len(eval_windows.keys):
         raise ValueError(f"groups must have one name for each of {len(eval_windows.keys)} windows, got {len(keys)}")
-    places, required = clip_index(keys), _min_count(_check_level(level))
-    clips = int(places.max()) + 1
-    if clips < required:
-        unit, highest = f"{clip}s" if groups is None else "groups", math.floor(100 * clips / (clips + 1))
+    places, required = cluster_index(keys), _min_count(_check_level(level))
+    clusters = int(places.max()) + 1
+    if clusters < required:
+        unit, highest = f"{cluster}s" if groups is None else "groups", math.floor(100 * clusters / (clusters + 1))
         raise ValueError(
             f"prediction bands of {100 * level:g} % need at least {required} {unit} of calibration windows, got "
-            f"{clips}; use more, or a level of at most {highest} %"
+            f"{clusters}; use more, or a level of at most {highest} %"
         )
     with progress_bar(progress) as bar:
 
@@ -347,7 +348,8 @@ def conformal_bands(
     if not all(factor.isfinite().all() for factor in factors.values()):
         raise ValueError(
             "these prediction bands would be infinite. Either forecasts have no spread, such as point forecasts: pass "
-            f"`residuals`, windows to estimate a spread. Or a value was observed in too few {clip}s: use more windows"
+            f"`residuals`, windows to estimate a spread. Or a value was observed in too few {cluster}s: use "
+            "more windows"
         )
     return PredictionBands(
         level=level,
@@ -356,21 +358,21 @@ def conformal_bands(
         samples=count,
         seed=seed,
         options=dict(options or {}),
-        clips=clips,
+        clusters=clusters,
         data=eval_windows.description(),
     )
 
 
-def clips_alike(values: Tensor, clips: Tensor) -> list[float]:
-    """Return values by clip whose mean, weighted by numbers of windows, is the plain mean over clips.
+def equally_weighted_clusters(values: Tensor, clusters: Tensor) -> list[float]:
+    """Return values by cluster whose mean, weighted by numbers of windows, is the plain mean over clusters.
 
     The standard error also equals the standard error of the plain mean.
 
     Args:
         values: score of every window, `(N,)`.
-        clips: clip of every window, from 0 to C - 1, `(N,)`.
+        clusters: cluster of every window, from 0 to C - 1, `(N,)`.
     """
-    means, windows = np.array(clip_means(values, clips)), np.bincount(clips.numpy())
+    means, windows = np.array(cluster_means(values, clusters)), np.bincount(clusters.numpy())
     result: list[float] = (means.mean() + (means - means.mean()) * windows.mean() / windows).tolist()
     return result
 
@@ -418,19 +420,19 @@ def _smallest(distances: Tensor, level: float) -> Tensor:
 def quantile(distances: Tensor, places: Tensor, level: float) -> Tensor:
     """Return the quantile (...) of known distances (N, ...) with the weights of hierarchical conformal prediction.
 
-    It is infinite if too few clips have a known distance.
+    It is infinite if too few clusters have a known distance.
 
     Args:
         distances: distances of windows, NaN if unknown.
-        places: clip of every window, (N,).
+        places: cluster of every window, (N,).
         level: level of the quantile.
     """
     is_known = (~distances.isnan()).flatten(1).double()
-    windows = is_known.new_zeros(int(places.max()) + 1, is_known.shape[1]).index_add_(0, places, is_known)  # by clip
-    clips = (windows > 0).sum(0)
+    windows = is_known.new_zeros(int(places.max()) + 1, is_known.shape[1]).index_add_(0, places, is_known)  # by cluster
+    clusters = (windows > 0).sum(0)
     ordered, order = distances.flatten(1).nan_to_num(nan=math.inf, posinf=math.inf).sort(0)
     weights = (is_known / windows[places].clamp(min=1)).gather(0, order)
-    reached = weights.cumsum(0) >= level * (clips + 1) - 1e-9
+    reached = weights.cumsum(0) >= level * (clusters + 1) - 1e-9
     result = ordered.gather(0, reached.byte().argmax(0, keepdim=True))[0]
     return result.masked_fill(~reached.any(0), math.inf).reshape(distances.shape[1:])
 

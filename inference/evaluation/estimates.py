@@ -1,10 +1,10 @@
 """Estimates of models on the same sequences, with errors over sequences and over training seeds.
 
 An estimate separates two sources of uncertainty: other held-out sequences, and another training seed. Sequences and
-seeds are crossed. Let y_sc, the mean of seed s over clip c, be mean + seed_s + clip_c + rest_sc (a two-way
-random-effects model). Then the mean over S seeds and C clips has
+seeds are crossed. Let y_sc, the mean of seed s over cluster c, be mean + seed_s + cluster_c + rest_sc (a two-way
+random-effects model). Then the mean over S seeds and C clusters has
 
-    V_sequences   of the mean over seeds, by clips (linearised, as in `evaluate`):  (var clip + var rest / S) / C
+    V_sequences   of the mean over seeds, by clusters (linearised, as in `evaluate`):  (var cluster + var rest / S) / C
     V_seeds       of the seeds' means, over S:                                      (var seed + var rest / C) / S
     V_rest        from the interaction's residuals:                                 var rest / (S C)
     V_total = V_sequences + V_seeds - V_rest, at least the larger of the first two; the sum would count the rest twice
@@ -20,7 +20,7 @@ f_i), as in the tests of Satterthwaite (1946) and Welch (1947). V_seeds of a dif
 
     f_total = V_total^2 / (V_sequences^2 / (C - 1) + sum over rows V_seeds^2 / (S - 1))
 
-Windows of one clip overlap, so errors over windows are clustered by clip.
+Windows of one cluster overlap, so errors over windows are clustered.
 """
 
 from __future__ import annotations
@@ -34,45 +34,46 @@ import scipy
 _ERRORS = ("sequences", "seeds", "total")
 
 
-def linearised(clip_means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted mean (...,) of clip means, and each clip's contribution (..., C) to its error.
+def linearised(cluster_means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted mean (...,) of cluster means, and each cluster's contribution (..., C) to its error.
 
-    The mean is a ratio of sums over clips, and its error is linearised.
+    The mean is a ratio of sums over clusters, and its error is linearised.
 
     Args:
-        clip_means: means (..., C) of C clips.
-        weights: weight (C,) of each clip, such as its number of windows.
+        cluster_means: means (..., C) of C clusters.
+        weights: weight (C,) of each cluster, such as its number of windows.
     """
     shares = weights / weights.sum()
-    mean = (shares * clip_means).sum(-1)
-    return mean, shares * (clip_means - mean[..., None])
+    mean = (shares * cluster_means).sum(-1)
+    return mean, shares * (cluster_means - mean[..., None])
 
 
 def clustered_variance(deviations: np.ndarray) -> float:
-    """Return the variance of a mean over windows from each clip's share of its error (C,); NaN for one clip."""
-    clips = len(deviations)
-    return clips / (clips - 1) * float((deviations**2).sum()) if clips > 1 else math.nan
+    """Return the variance of a mean over windows from each cluster's share of its error (C,); NaN for one cluster."""
+    clusters = len(deviations)
+    return clusters / (clusters - 1) * float((deviations**2).sum()) if clusters > 1 else math.nan
 
 
 def effective_number(shares: np.ndarray, deviations: np.ndarray, most: float) -> int:
-    """Return how many independent draws would give a histogram as uncertain as these draws, which depend within clips.
+    """Return how many independent draws would give a histogram as uncertain as these draws, which depend within
+    clusters.
 
     The number is one over the root mean square of v / (p (1 - p)) over shares p, with v the clustered variance of the
     observed share. For N independent draws this ratio is 1 / N. With the mean instead of the root mean square, this is
     the correction of Rao and Scott (1981) for design effects. The root mean square is larger if the effects differ, as
-    in their second-order correction (1984). With few clips the variances are uncertain, so the number is reduced by the
-    squared ratio of Student's interval to the normal one.
+    in their second-order correction (1984). With few clusters the variances are uncertain, so the number is reduced by
+    the squared ratio of Student's interval to the normal one.
 
     Args:
         shares: expected shares `(G,)`, between 0 and 1.
-        deviations: contribution of each of C > 1 clips to the error of the observed share, `(G, C)` (`linearised`).
+        deviations: contribution of each of C > 1 clusters to the error of the observed share, `(G, C)` (`linearised`).
         most: total number of draws.
     """
-    clips = deviations.shape[-1]
-    if most <= clips:  # one draw per clip, and clips are independent
+    clusters = deviations.shape[-1]
+    if most <= clusters:  # one draw per cluster, and clusters are independent
         return int(most)
-    effects = clips / (clips - 1) * (deviations**2).sum(-1) / (shares * (1 - shares))
-    wider = (scipy.special.stdtrit(clips - 1, 0.975) / scipy.special.ndtri(0.975)) ** 2
+    effects = clusters / (clusters - 1) * (deviations**2).sum(-1) / (shares * (1 - shares))
+    wider = (scipy.special.stdtrit(clusters - 1, 0.975) / scipy.special.ndtri(0.975)) ** 2
     size = wider * math.sqrt((effects**2).mean())
     return int(max(1.0, min(most, 1 / size if size else math.inf)))
 
@@ -102,11 +103,11 @@ def student_interval(mean: float, error: float, freedom: float, level: float = 0
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over sequences and seeds with standard errors; an error is NaN if unknown (one clip, one seed).
+    """Mean over sequences and seeds with standard errors; an error is NaN if unknown (one cluster, one seed).
 
     Args:
         mean: weighted mean.
-        sequences: standard error over sequences, clustered by clip.
+        sequences: standard error over sequences, clustered.
         seeds: standard error over training seeds.
         total: standard error from both.
         freedom: degrees of freedom of `sequences`, `seeds` and `total`, in this order.
@@ -169,7 +170,7 @@ def _freedom(total: float, *parts: tuple[float, float]) -> float:
 
 @dataclass(frozen=True)
 class TwoWayErrors:
-    """Mean of a model, error contributions of clips (C,), variances V_seeds and V_rest, and number of seeds S."""
+    """Mean of a model, error contributions of clusters (C,), variances V_seeds and V_rest, and number of seeds S."""
 
     mean: float
     deviations: np.ndarray
@@ -179,7 +180,7 @@ class TwoWayErrors:
 
     @classmethod
     def of(cls, means: np.ndarray, weights: np.ndarray) -> TwoWayErrors:
-        """Return the statistics of means by seed and clip (S, C) with the clips' weights (C,)."""
+        """Return the statistics of means by seed and cluster (S, C) with the clusters' weights (C,)."""
         by_seed, deviations = linearised(means, weights)
         common = deviations.mean(0)
         count = len(means)
@@ -192,8 +193,9 @@ class TwoWayErrors:
         return cls(float(by_seed.mean()), common, float(by_seed.var(ddof=1)) / count, rest, count)
 
     @classmethod
-    def by_clip(cls, values: np.ndarray, weights: np.ndarray, places: np.ndarray) -> TwoWayErrors:
-        """Return the statistics of values (S, N) by seed and sequence, with weights (N,) and clips (N,) of sequences.
+    def by_cluster(cls, values: np.ndarray, weights: np.ndarray, places: np.ndarray) -> TwoWayErrors:
+        """Return the statistics of values (S, N) by seed and sequence, with weights (N,) and clusters (N,) of
+        sequences.
 
         A value is a sum over its sequence, so the mean is the sum of values divided by the sum of weights.
         """
@@ -201,11 +203,11 @@ class TwoWayErrors:
         return cls.of(np.stack([np.bincount(places, weights=seed) for seed in values]) / totals, totals)
 
     def estimate(self, other: TwoWayErrors | None = None) -> Estimate:
-        """Return the weighted mean over seeds and clips, or its paired difference to another model's mean.
+        """Return the weighted mean over seeds and clusters, or its paired difference to another model's mean.
 
-        The error over sequences is clustered by clip. The error over seeds uses the variance of the seeds' means. The
+        The error over sequences is clustered. The error over seeds uses the variance of the seeds' means. The
         total is V_sequences + V_seeds - V_rest, but at least the larger of the first two variances. With one seed, the
-        error over seeds and the total are NaN; with one clip, the error over sequences and the total are NaN.
+        error over seeds and the total are NaN; with one cluster, the error over sequences and the total are NaN.
 
         Args:
             other: statistics of the model to subtract, on the same sequences; None for the mean itself.

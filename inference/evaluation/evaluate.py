@@ -1,14 +1,14 @@
 """Evaluation on held-out windows: forecasts and bounds.
 
-Two kinds of scores are kept apart. *Free-running*: the model reads the observed frames and forecasts K futures, which
+Two kinds of scores are kept apart. *Free-running*: the model reads the observed steps and forecasts K futures, which
 `Measure`s compare with the true one; the *log score* is the density of such forecasts at the true future.
-*Teacher-forced*: the model reads every frame of the window, and its bound on log p(x_{1:T}) is reported in nats per
-frame.
+*Teacher-forced*: the model reads every step of the window, and its bound on log p(x_{1:T}) is reported in nats per
+step.
 
 Every evaluation includes reference rows that any method should beat, such as repeating the last value; `References`
 lists them. A model without latents, passed as one of the models, is another reference. Some scores add a row with the
 true futures for comparison, which no method is expected to beat. All rows are scored on the same windows. Windows of
-one clip overlap, so standard errors are clustered by clip and `Evaluation.difference` is paired.
+one cluster overlap, so standard errors are clustered and `Evaluation.difference` is paired.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from .evaluation_windows import EvaluationWindows, on_device_of, prepare_windows
 from .record import plain
 from .references import Forecaster, References
 from .result import progress_bar
-from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clip_means, proper
+from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, cluster_means, proper
 
 
 def evaluate(
@@ -75,7 +75,7 @@ def evaluate(
         references: whether to add all available reference rows; or the names of some (`References`).
         training_windows: training data of "mean", "climatology" and "nearest neighbours", such as x (N, T, D); without
             it these are omitted.
-        season: period of "seasonal", in frames; by default from the windows' description.
+        season: period of "seasonal", in steps; by default from the windows' description.
         configs: `{name: configuration}`, stored with the rows; any JSON value.
         options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at the mean of the
             prior.
@@ -118,27 +118,27 @@ def evaluate(
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
-            clip_scores, histograms = evaluator.forecasts(name, forecaster, count, parts(name))
-            rows[name] = Row(count, clip_scores, histograms=histograms)
+            cluster_scores, histograms = evaluator.forecasts(name, forecaster, count, parts(name))
+            rows[name] = Row(count, cluster_scores, histograms=histograms)
         for name, each in models.items():
             with seeded_evaluation(each, seed):
                 forecaster = forecaster_of(
                     each, eval_windows, samples, {"draw_emission": is_drawn[name], **(options or {})}
                 )
-                clip_scores, histograms = evaluator.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
+                cluster_scores, histograms = evaluator.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with seeded_evaluation(each, seed):
-                    clip_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"))
+                    cluster_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"))
                 with seeded_evaluation(each, seed):
-                    clip_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"))
+                    cluster_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}
-            rows[name] = Row(samples, clip_scores, equations, dict((configs or {}).get(name, {})), histograms)
+            rows[name] = Row(samples, cluster_scores, equations, dict((configs or {}).get(name, {})), histograms)
 
     kinds = {"drawn" if each else "mean" for each in is_drawn.values() or [_is_drawn(None, draw_emission, means)]}
     return Evaluation(
         rows=rows,
         metrics=evaluator.metrics(rows),
-        clips=eval_windows.clips,
+        clusters=eval_windows.clusters,
         data=eval_windows.description(),
         protocol=plain(dataclasses.asdict(windows.protocol)),
         samples=samples,
@@ -214,7 +214,7 @@ def _forecast_notes(measures: Sequence[Measure], samples: int, of_means: Sequenc
 
 @dataclass(frozen=True)
 class _Evaluator:
-    """Computation of the scores of each row, by clip."""
+    """Computation of the scores of each row, by cluster."""
 
     eval_windows: EvaluationWindows
     measures: Sequence[Measure]
@@ -225,7 +225,7 @@ class _Evaluator:
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return free-running scores (C,) and histograms (C, bins) by name, for each of C clips.
+        """Return free-running scores (C,) and histograms (C, bins) by name, for each of C clusters.
 
         Args:
             name: name of the method, for errors.
@@ -250,22 +250,22 @@ class _Evaluator:
         return scores, histograms
 
     def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
-        """Return bounds, KL terms and k-hat by name, in nats per frame, for each clip."""
+        """Return bounds, KL terms and k-hat by name, in nats per step, for each cluster."""
         results = []
         for part in parts:
             batch = on_device_of(model, self.eval_windows.part(part))
             terms = SequenceELBO().terms(model, batch)
-            scores = {"ELBO": terms.per_frame}
-            scores |= {f"KL {latent}": kl / terms.frames for latent, kl in terms.kl.items()}
+            scores = {"ELBO": terms.per_step}
+            scores |= {f"KL {latent}": kl / terms.n_steps for latent, kl in terms.kl.items()}
             if self.bound_particles:
                 weighted = iwae_bound(model, batch, particles=self.bound_particles)
-                scores |= {"IWAE bound": weighted.bound / terms.frames, "k-hat": weighted.khat}
+                scores |= {"IWAE bound": weighted.bound / terms.n_steps, "k-hat": weighted.khat}
             refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.eval_windows.keys[part])
             results.append({metric: values.cpu() for metric, values in scores.items()})
         return self._means(_concatenate(results))
 
     def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
-        """Return the log score by its name, in nats per predicted frame, for each clip; empty if not requested."""
+        """Return the log score by its name, in nats per predicted step, for each cluster; empty if not requested."""
         if not self.log_score_particles:
             return {}
         results = []
@@ -278,18 +278,18 @@ class _Evaluator:
 
     def metrics(self, rows: Mapping[str, Row]) -> dict[str, Metric]:
         """Return the metrics of all scores in the rows, in the order of the table."""
-        names = {name for row in rows.values() for name in row.clip_means}
+        names = {name for row in rows.values() for name in row.cluster_means}
         latents = sorted(name for name in names if name.startswith("KL "))
-        _, frame = axis_names(self.eval_windows.windows.description)
+        _, step = axis_names(self.eval_windows.windows.description)
         bounds = {"log score": LOG_SCORE, **TEACHER_FORCED, **dict.fromkeys(latents, KL)}
         order = {measure.name: measure.metric for measure in self.measures}
         order |= {
-            name: dataclasses.replace(each, unit=each.unit.replace("step", frame)) for name, each in bounds.items()
+            name: dataclasses.replace(each, unit=each.unit.replace("step", step)) for name, each in bounds.items()
         }
         return {name: metric for name, metric in order.items() if name in names}
 
     def _means(self, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        return {name: np.array(clip_means(values, self.eval_windows.places)) for name, values in scores.items()}
+        return {name: np.array(cluster_means(values, self.eval_windows.places)) for name, values in scores.items()}
 
 
 def _references(

@@ -32,12 +32,12 @@ _MOST_RANKS = 10_000  # the envelope of so many ranks takes a second
 
 @dataclass(frozen=True)
 class Score:
-    """Mean over windows, or score of the whole set, with its standard error, clustered by clip (NaN for one clip).
+    """Mean over windows, or score of the whole set, with its standard error, clustered (NaN for one cluster).
 
     Args:
         mean: mean over windows.
         standard_error: standard error of the mean.
-        freedom: degrees of freedom of the error, the number of clips minus one.
+        freedom: degrees of freedom of the error, the number of clusters minus one.
     """
 
     mean: float
@@ -58,16 +58,16 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Scores of one method by clip (see `Measure.pool`), its number of samples, equations and configuration.
+    """Scores of one method by cluster (see `Measure.pool`), its number of samples, equations and configuration.
 
-    Histograms, such as the PIT's, have one share per bin for each clip.
+    Histograms, such as the PIT's, have one share per bin for each cluster.
     """
 
     samples: int
-    clip_means: Annotated[dict[str, np.ndarray], Dims("clip", name="{}")]
+    cluster_means: Annotated[dict[str, np.ndarray], Dims("cluster", name="{}")]
     equations: dict[str, str] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
-    histograms: Annotated[dict[str, np.ndarray], Dims("clip", "bin", name="histogram of {}")] = field(
+    histograms: Annotated[dict[str, np.ndarray], Dims("cluster", "bin", name="histogram of {}")] = field(
         default_factory=dict
     )
 
@@ -81,8 +81,8 @@ class Evaluation(Result):
     Attributes:
         rows: `{method: Row}`.
         metrics: metric of each score that at least one method has, in the order of the table.
-        clips: `{"split/clip": number of its windows}`, in the order of `Row.clip_means`.
-        data: fingerprint, number of windows, frames and coordinates of a window, and the windows' description.
+        clusters: `{"split/cluster": number of its windows}`, in the order of `Row.cluster_means`.
+        data: fingerprint, number of windows, steps and coordinates of a window, and the windows' description.
         protocol: fields of the windows' protocol.
         samples: K, number of forecasts requested from every method.
         emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it; "drawn or mean" if
@@ -104,7 +104,7 @@ class Evaluation(Result):
 
     rows: Annotated[dict[str, Row], MODELS]
     metrics: dict[str, Metric]
-    clips: dict[str, int]
+    clusters: dict[str, int]
     data: dict[str, Any]
     protocol: dict[str, Any]
     samples: int
@@ -117,7 +117,7 @@ class Evaluation(Result):
     options: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, method: str) -> dict[str, Score]:
-        return {name: self._score(name, means) for name, means in self._row(method).clip_means.items()}
+        return {name: self._score(name, means) for name, means in self._row(method).cluster_means.items()}
 
     def difference(self, first: str, second: str, metric: str) -> Score:
         """Return the mean paired difference of two methods in a metric, first minus second, with its standard error.
@@ -150,14 +150,14 @@ class Evaluation(Result):
         return self._score(metric, numerator / denominator + (values - numerator / denominator * other) / denominator)
 
     def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:
-        """Return the values of two methods by clip."""
+        """Return the values of two methods by cluster."""
         means = []
         for method in (first, second):
             row = self._row(method)
-            if metric not in row.clip_means:
-                suggestion = nearest(metric, row.clip_means)
-                raise KeyError(f"{method!r} has no score {metric!r}{suggestion}; it has {', '.join(row.clip_means)}")
-            means.append(row.clip_means[metric])
+            if metric not in row.cluster_means:
+                suggestion = nearest(metric, row.cluster_means)
+                raise KeyError(f"{method!r} has no score {metric!r}{suggestion}; it has {', '.join(row.cluster_means)}")
+            means.append(row.cluster_means[metric])
         return means
 
     @override
@@ -227,9 +227,9 @@ class Evaluation(Result):
     def departure(self, method: str, histogram: str = "PIT", alpha: float = 0.05) -> tuple[np.ndarray, ...]:
         """Return the difference between a method's PIT distribution and uniform, with a simultaneous band.
 
-        The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Ranks of one clip depend
-        on each other, so the envelope is for their effective number, estimated from their spread over clips
-        (`estimates.effective_number`). It is an approximation, unless each clip contributes a single number. A curve
+        The band is the exact envelope of independent uniform ranks (`calibration.envelope`). Ranks of one cluster
+        depend on each other, so the envelope is for their effective number, estimated from their spread over clusters
+        (`estimates.effective_number`). It is an approximation, unless each cluster contributes a single number. A curve
         that leaves the band at any point indicates that forecasts are not calibrated.
 
         Args:
@@ -239,17 +239,17 @@ class Evaluation(Result):
 
         Returns:
             Points between bins, the share of the PIT below each minus the point itself, and the lower and upper end of
-            the band, `(bins - 1,)` each; the band is NaN for one clip.
+            the band, `(bins - 1,)` each; the band is NaN for one cluster.
 
         Raises:
             KeyError: when the method or histogram does not exist.
         """
         shares = self._histogram(method, histogram).cumsum(1)[:, :-1].T
         points = np.arange(1, len(shares) + 1) / (len(shares) + 1)
-        below, deviations = linearised(shares, np.array(list(self.clips.values())))
-        if len(self.clips) == 1:
+        below, deviations = linearised(shares, np.array(list(self.clusters.values())))
+        if len(self.clusters) == 1:
             return points, below - points, points * np.nan, points * np.nan
-        n_values = (self.data["frames"] - self.protocol["observed"]) * self.data["coordinates"]
+        n_values = (self.data["steps"] - self.protocol["observed"]) * self.data["coordinates"]
         numbers = self.data["windows"] * self.basis.get(histogram, {}).get("numbers", n_values)
         n_effective = effective_number(points, deviations, min(numbers, _MOST_RANKS))
         _, low, high = envelope(n_effective, len(points), alpha)
@@ -301,24 +301,24 @@ class Evaluation(Result):
 
     @styled
     def plot_horizon(self) -> Figure:
-        """Draw PIT histograms at some frames of the future, and coverage over these frames, for each method.
+        """Draw PIT histograms at some steps of the future, and coverage over these steps, for each method.
 
-        Bands are two standard errors, clustered by clip. The scores come from `scores.over_horizon`.
+        Bands are two standard errors, clustered. The scores come from `scores.over_horizon`.
 
         Returns:
             A matplotlib figure.
 
         Raises:
-            KeyError: when no method has a histogram of a single frame.
+            KeyError: when no method has a histogram of a single step.
         """
-        _, frame = axis_names(self.data)
+        _, step = axis_names(self.data)
 
-        def by_frame(score: str, names: Iterable[str]) -> dict[int, str]:
-            """Return the names of a score by frame."""
-            matches = (re.fullmatch(rf"{re.escape(score)}, {re.escape(frame)} (\d+)", name) for name in names)
+        def by_step(score: str, names: Iterable[str]) -> dict[int, str]:
+            """Return the names of a score by step."""
+            matches = (re.fullmatch(rf"{re.escape(score)}, {re.escape(step)} (\d+)", name) for name in names)
             return {int(each[1]): each[0] for each in matches if each}
 
-        by_method = {method: by_frame("PIT", row.histograms) for method, row in self.rows.items()}
+        by_method = {method: by_step("PIT", row.histograms) for method, row in self.rows.items()}
         by_method = {method: histograms for method, histograms in by_method.items() if histograms}
         if not by_method:
             raise KeyError("this evaluation has no PIT histograms of single steps; evaluate with scores=over_horizon")
@@ -329,14 +329,14 @@ class Evaluation(Result):
             for panel, (place, name) in zip(histogram_panels, histograms.items(), strict=True):
                 self._draw(panel, method, name)
                 panel.sharey(histogram_panels[0])
-                panel.set_title(f"{frame} {place}")
+                panel.set_title(f"{step} {place}")
                 panel.set_xlabel("PIT")
                 panel.set_xticks([0, 1])
             histogram_panels[0].set_ylim(bottom=0)
             histogram_panels[0].set_ylabel(f"{textwrap.fill(method, 18)}\nPIT / uniform", parse_math=False)
             scores = self[method]
             for order, level in enumerate((50, 80, 90)):
-                covered = {place: scores[name] for place, name in by_frame(f"coverage {level} %", scores).items()}
+                covered = {place: scores[name] for place, name in by_step(f"coverage {level} %", scores).items()}
                 means, errors = (
                     np.array([getattr(each, attribute) for each in covered.values()])
                     for attribute in ("mean", "standard_error")
@@ -348,15 +348,15 @@ class Evaluation(Result):
                 coverage_panel.axhline(level / 100, color=f"C{order}", linewidth=0.8, linestyle=":")
             coverage_panel.set_ylim(0, 1)
             coverage_panel.set_title("coverage")
-            coverage_panel.set_xlabel(frame, parse_math=False)
+            coverage_panel.set_xlabel(step, parse_math=False)
         figure.suptitle(self._title(), parse_math=False)
         return figure
 
     def _draw(self, panel: Axes, method: str, histogram: str) -> None:
         """Draw a histogram relative to uniform, with two standard errors of each bin."""
-        clip_shares = self.rows[method].histograms[histogram].T
-        bins = len(clip_shares)
-        shares, deviations = linearised(clip_shares, np.array(list(self.clips.values())))
+        cluster_shares = self.rows[method].histograms[histogram].T
+        bins = len(cluster_shares)
+        shares, deviations = linearised(cluster_shares, np.array(list(self.clusters.values())))
         errors = np.array([math.sqrt(clustered_variance(each)) for each in deviations])
         edges = np.linspace(0, 1, bins + 1)
         low, high = (bins * (shares + reach * errors) for reach in (-2, 2))
@@ -371,13 +371,15 @@ class Evaluation(Result):
 
     @override
     def labels(self) -> dict[str, Sequence[str]]:
-        return {"clip": [*self.clips]}
+        return {"cluster": [*self.clusters]}
 
     @override
     def check(self) -> None:
-        if self.extents.get("clip", {len(self.clips)}) != {len(self.clips)}:
-            raise ValueError(f"`clips` lists {len(self.clips)} clips, but arrays have {self.extents['clip']}")
-        if unknown := {name for row in self.rows.values() for name in row.clip_means} - self.metrics.keys():
+        if self.extents.get("cluster", {len(self.clusters)}) != {len(self.clusters)}:
+            raise ValueError(
+                f"`clusters` lists {len(self.clusters)} clusters, but arrays have {self.extents['cluster']}"
+            )
+        if unknown := {name for row in self.rows.values() for name in row.cluster_means} - self.metrics.keys():
             raise ValueError(f"metrics has no entry for {', '.join(sorted(unknown))}")
 
     def _histogram(self, method: str, name: str) -> np.ndarray:
@@ -394,20 +396,20 @@ class Evaluation(Result):
             )
         return self.rows[method]
 
-    def _score(self, metric: str, clip_means: np.ndarray) -> Score:
-        valid = ~np.isnan(clip_means) if self.metrics[metric].partial else slice(None)
-        mean, deviations = linearised(clip_means[valid], np.array(list(self.clips.values()))[valid])
+    def _score(self, metric: str, cluster_means: np.ndarray) -> Score:
+        valid = ~np.isnan(cluster_means) if self.metrics[metric].partial else slice(None)
+        mean, deviations = linearised(cluster_means[valid], np.array(list(self.clusters.values()))[valid])
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
     def _caption(self) -> str:
-        freedom = f"{len(self.clips) - 1} degrees of freedom"
-        clip, _ = axis_names(self.data)
-        error = f"mean ± standard error over windows, clustered by {clip} ({freedom}); K: forecasts of each window"
+        freedom = f"{len(self.clusters) - 1} degrees of freedom"
+        cluster, _ = axis_names(self.data)
+        error = f"mean ± standard error over windows, clustered by {cluster} ({freedom}); K: forecasts of each window"
         return "\n".join([error, *self.notes])
 
     def _title(self) -> str:
         name = str(self.protocol.get("name", ""))
-        parts = [name, f"{self.data['windows']} windows of {len(self.clips)} {axis_names(self.data)[0]}s"]
+        parts = [name, f"{self.data['windows']} windows of {len(self.clusters)} {axis_names(self.data)[0]}s"]
         parts += self.data.get("title", [])
         parts += [f"{name} {value}" for name, value in self.options.items()]
         parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]

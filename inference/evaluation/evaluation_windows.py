@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ...data.batch import Batch
-from ...data.sequences import HeldOutWindows, axis_names, clusters, held_out_windows
+from ...data.sequences import HeldOutWindows, axis_names, cluster_keys, held_out_windows
 from ...locking import seeded
 from ...program.conditional import evaluating
 from ...program.model import DynamicalVAE
@@ -23,7 +23,7 @@ class EvaluationWindows:
     Args:
         windows: source of the windows.
         batch: batch of all windows.
-        observed: O, number of observed frames.
+        observed: O, number of observed steps.
         keys: (split, sequence, first step) of each window.
     """
 
@@ -56,19 +56,19 @@ class EvaluationWindows:
         return self.part(part).past(self.observed)
 
     @property
-    def clips(self) -> dict[str, int]:
-        """Number of windows by clip, `{"split/clip": number}`."""
-        return dict(Counter(f"{split}/{clip}" for split, clip, _ in clusters(self.windows)))
+    def clusters(self) -> dict[str, int]:
+        """Number of windows by cluster, `{"split/cluster": number}`."""
+        return dict(Counter(f"{split}/{cluster}" for split, cluster, _ in cluster_keys(self.windows)))
 
     @property
     def places(self) -> Tensor:
-        """Index of the clip of every window in `clips`, `(N,)`."""
-        return clip_index(clusters(self.windows))
+        """Index of the cluster of every window in `clusters`, `(N,)`."""
+        return cluster_index(cluster_keys(self.windows))
 
     def description(self) -> dict[str, Any]:
         """Return the description of the data that a result contains."""
-        count, frames, coordinates = self.x.shape
-        description = {"fingerprint": self.windows.fingerprint, "windows": count, "frames": frames}
+        count, steps, coordinates = self.x.shape
+        description = {"fingerprint": self.windows.fingerprint, "windows": count, "steps": steps}
         return {**description, "coordinates": coordinates, **self._shares, **self.windows.description}
 
     @property
@@ -117,17 +117,17 @@ def prepare_windows(data: Any) -> EvaluationWindows:
         for part, mask in (("past", eval_windows.mask[:, :observed]), ("future", eval_windows.mask[:, observed:])):
             if (empty := ~mask.flatten(1).any(1)).any():
                 split, name, start = eval_windows.keys[int(empty.nonzero()[0])]
-                _, frame = axis_names(windows.description)
+                _, step = axis_names(windows.description)
                 raise ValueError(
-                    f"the {part} of the window at {frame} {start} of {name!r} has no observation ({split}); remove it"
+                    f"the {part} of the window at {step} {start} of {name!r} has no observation ({split}); remove it"
                 )
     return eval_windows
 
 
-def clip_index(keys: Sequence[tuple[str, str, int]]) -> Tensor:
-    """Return the clip of every window as an index `(N,)`; clips are numbered in order of appearance."""
+def cluster_index(keys: Sequence[tuple[str, str, int]]) -> Tensor:
+    """Return the cluster of every window as an index `(N,)`; clusters are numbered in order of appearance."""
     order: dict[str, int] = {}
-    return torch.tensor([order.setdefault(f"{split}/{clip}", len(order)) for split, clip, _ in keys])
+    return torch.tensor([order.setdefault(f"{split}/{cluster}", len(order)) for split, cluster, _ in keys])
 
 
 @contextmanager

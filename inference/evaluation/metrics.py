@@ -10,7 +10,7 @@ to K. With L samples below it and E equal to it, its PIT is (L + V (E + 1)) / (K
 uniform on 0 to 1 for every K, and also for discrete data (Czado, Gneiting and Held 2009). Shares and moments are
 expectations over V, without draws. Their values for calibrated forecasts are exact for every K.
 
-Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T frames with D coordinates; truth `(..., T, D)`; the result
+Shapes everywhere: samples `(..., K, T, D)`, K forecasts of T steps with D coordinates; truth `(..., T, D)`; the result
 has the leading shape `(...)`. Functions accept torch tensors and numpy arrays and return a tensor. NaN in a truth was
 not observed and is ignored. Frames without observations are ignored, too. The value for a data set is the plain mean
 over its windows. Every function raises ValueError for shapes that do not fit. Windows are scored one after another, so
@@ -69,7 +69,7 @@ def energy_score(samples: Array, truth: Array, diversity: Array | None = None) -
 
 
 def continuous_ranked_probability_score(samples: Array, truth: Array) -> Tensor:
-    """Return the CRPS of each number, averaged over frames and coordinates; proper, lower is better.
+    """Return the CRPS of each number, averaged over steps and coordinates; proper, lower is better.
 
     CRPS = mean_k |X_k - y| - 1/2 mean_{j<k} |X_j - X_k|, the unbiased ("fair") estimate, whose expectation does not
     depend on K: integral of (P(X <= u) - 1[y <= u])^2 du. It is the energy score of one number, and ignores dependence
@@ -122,7 +122,7 @@ def probability_integral_transform(samples: Array, truth: Array, uniform: Array)
 
 
 def pit_mean(samples: Array, truth: Array) -> Tensor:
-    """Return the mean PIT over frames and coordinates: 1/2 for calibrated forecasts, less for too high ones.
+    """Return the mean PIT over steps and coordinates: 1/2 for calibrated forecasts, less for too high ones.
 
     Args:
         samples: samples `(..., K, T, D)`.
@@ -232,7 +232,7 @@ def coverage(samples: Array, truth: Array, level: float) -> Tensor:
 
 
 def interval_width(samples: Array, level: float) -> Tensor:
-    """Return the width of the central interval of `coverage`, averaged over frames and coordinates: sharpness.
+    """Return the width of the central interval of `coverage`, averaged over steps and coordinates: sharpness.
 
     The interval is from the h-th smallest to the h-th largest of K samples. It is linear between samples if h is not
     whole, and from the smallest to the largest one below h = 1.
@@ -258,9 +258,9 @@ def interval_width(samples: Array, level: float) -> Tensor:
 
 
 def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
-    """Return the variogram score of the coordinates of each frame; proper, lower is better (Scheuerer and Hamill 2015).
+    """Return the variogram score of the coordinates of each step; proper, lower is better (Scheuerer and Hamill 2015).
 
-    VS = mean over frames and coordinate pairs i < j of (|y_i - y_j|^p - mean_k v_k)^2 - var_k v_k / K, where v_k =
+    VS = mean over steps and coordinate pairs i < j of (|y_i - y_j|^p - mean_k v_k)^2 - var_k v_k / K, where v_k =
     |X_ki - X_kj|^p. Subtracting the variance of the mean gives the unbiased ("fair") estimate, whose expectation does
     not depend on K, and which may be negative. With K = 1 the forecast is a point mass and nothing is subtracted.
 
@@ -286,7 +286,7 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
     count, scores = samples.shape[-3], []
     windows = samples.reshape(-1, count, steps, size), truth.reshape(-1, steps, size)
     for x, y in zip(*(part.split(max(1, CACHED // (count * steps * size))) for part in windows), strict=True):
-        n_observed, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # by frame
+        n_observed, total = (~y.isnan()).sum(-1), y.new_zeros(len(y))  # by step
         missing = bool((n_observed < size).any())
         # Coordinates first, so that subtracted values are contiguous. The pairs of one coordinate fit in the cache; all
         # D * D pairs would not.
@@ -355,49 +355,53 @@ def gaussian_frechet_distance(mean: Tensor, covariance: Tensor, other_mean: Tens
 
 
 def frechet_pseudo_values(real: Tensor, generated: Tensor, places: Tensor) -> tuple[float, ...]:
-    """Return the Fréchet distance between features of true and generated windows, as jackknife pseudo-values of clips.
+    """Return the Fréchet distance between features of true and generated windows, as jackknife pseudo-values of
+    clusters.
 
     `jackknife_pseudo_values` defines these values.
 
     Args:
         real: features `(N, F)` of the true futures.
         generated: features `(N, K, F)` of the generated futures.
-        places: clip of every window, from 0 to C - 1, `(N,)`.
+        places: cluster of every window, from 0 to C - 1, `(N,)`.
     """
     centre = real.mean(0)  # second moments lose digits far from 0
-    sets = _moments_without_clips(real[:, None] - centre, places), _moments_without_clips(generated - centre, places)
+    sets = (
+        _moments_without_clusters(real[:, None] - centre, places),
+        _moments_without_clusters(generated - centre, places),
+    )
     distance = gaussian_frechet_distance(*sets[0], *sets[1])
     return jackknife_pseudo_values(distance[0], distance[1:], places)
 
 
 def jackknife_pseudo_values(distance: Tensor, without: Tensor, places: Tensor) -> tuple[float, ...]:
-    """Return the distance of a set of windows as a jackknife pseudo-value of each clip.
+    """Return the distance of a set of windows as a jackknife pseudo-value of each cluster.
 
     The pseudo-value is d + (1/w - 1) (d - d') (Busing, Meijer and van der Leeden 1999). d' is the distance without the
-    clip, and w the clip's share of the windows. A common constant is added so that the mean over windows is d, because
-    the mean of plain pseudo-values is corrected for bias. For a mean over windows, pseudo-values are the means of the
-    clips, so the errors of both kinds of scores are computed alike.
+    cluster, and w the cluster's share of the windows. A common constant is added so that the mean over windows is d,
+    because the mean of plain pseudo-values is corrected for bias. For a mean over windows, pseudo-values are the means
+    of the clusters, so the errors of both kinds of scores are computed alike.
 
     Args:
         distance: d, distance of the whole set.
-        without: d' of each of C > 1 clips, `(C,)`.
-        places: clip of every window, `(N,)`.
+        without: d' of each of C > 1 clusters, `(C,)`.
+        places: cluster of every window, `(N,)`.
     """
     shares = places.bincount().double() / len(places)
     pseudo = distance + (1 / shares - 1) * (distance - (without if len(shares) > 1 else distance))
     return tuple((pseudo - (shares * pseudo).sum() + distance).tolist())
 
 
-def _moments_without_clips(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+def _moments_without_clusters(features: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """Return means (1 + C, F) and covariances (1 + C, F, F) of features (N, K, F).
 
-    Entry 0 is for all windows. Each other entry omits the windows of one of C > 1 clips.
+    Entry 0 is for all windows. Each other entry omits the windows of one of C > 1 clusters.
     """
 
     def sums(values: Tensor) -> Tensor:
-        by_clip = values.new_zeros(int(places.max()) + 1, *values.shape[1:]).index_add_(0, places, values)
-        total = by_clip.sum(0, keepdim=True)
-        return torch.cat([total, total - by_clip]) if len(by_clip) > 1 else total
+        by_cluster = values.new_zeros(int(places.max()) + 1, *values.shape[1:]).index_add_(0, places, values)
+        total = by_cluster.sum(0, keepdim=True)
+        return torch.cat([total, total - by_cluster]) if len(by_cluster) > 1 else total
 
     count = sums(features.new_full((len(features), 1), features.shape[1]))
     mean = sums(features.sum(1)) / count
@@ -427,7 +431,7 @@ def _ranks_outside(samples: Tensor, level: float) -> float:
 def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
     """Wrap a score of distances so that it ignores missing values of a truth (T, D).
 
-    It uses frames with observations, and sets missing numbers of samples and truth to 0.
+    It uses steps with observations, and sets missing numbers of samples and truth to 0.
     """
 
     def observed_score(samples: Tensor, truth: Tensor) -> Tensor:
@@ -441,7 +445,7 @@ def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor
 
 
 def displacement(samples: Tensor, truth: Tensor) -> Tensor:
-    """Return the Euclidean distance over the coordinates of each frame."""
+    """Return the Euclidean distance over the coordinates of each step."""
     return torch.linalg.vector_norm(samples - truth, dim=-1)
 
 

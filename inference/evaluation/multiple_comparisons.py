@@ -5,9 +5,9 @@ procedure (1979), which are valid for all pairs at once under any dependence. `c
 set (Hansen, Lunde and Nason, 2011): models that are not significantly worse than one another. It repeatedly drops the
 model that is most clearly worse, and contains the best model with a probability of at least its level. The less
 informative the data, the more models it contains. `required` computes the power of a paired difference for other
-numbers of seeds and clips.
+numbers of seeds and clusters.
 
-Errors are computed as in `estimates`: over clips, which models share, and over training seeds, which they do not.
+Errors are computed as in `estimates`: over clusters, which models share, and over training seeds, which they do not.
 Variances over few seeds are uncertain. A variance that is small by chance makes a difference look significant when it
 is not. The null distribution of the confidence set therefore draws variances first: each is the measured one times f
 divided by a chi-squared draw with its f degrees of freedom. For a single difference this is Student's t (the fiducial
@@ -83,7 +83,7 @@ def pairs(contenders: Mapping[str, TwoWayErrors]) -> Pairs:
     """Return all paired differences, with p-values adjusted for their number.
 
     Args:
-        contenders: score on the same clips for each name.
+        contenders: score on the same clusters for each name.
 
     Returns:
         Differences of each model with all later ones; p-values are NaN if a model has one seed.
@@ -139,7 +139,7 @@ def confidence_set(
     """Return the model confidence set, based on the differences of all remaining pairs.
 
     Args:
-        contenders: score on the same clips for each name.
+        contenders: score on the same clusters for each name.
         better: "lower" or "higher".
         level: probability that the best model is in the set.
         over_seeds: whether to account for other training seeds; if False, the set is for these weights only.
@@ -148,8 +148,8 @@ def confidence_set(
 
     Raises:
         ValueError: when `contenders` is empty, `level` is not between 0 and 1, or `better` is neither "lower" nor
-            "higher". Also when scores are on one clip, on different clips or not finite, or a model has one seed with
-            `over_seeds`.
+            "higher". Also when scores are on one cluster, on different clusters or not finite, or a model has one seed
+            with `over_seeds`.
     """
     if not contenders or not 0 < level < 1 or draws < 1:
         raise ValueError(
@@ -164,21 +164,21 @@ def confidence_set(
             f"{', '.join(single)} has one training seed, so no error over seeds exists; pass more seeds, or "
             "over_seeds=False to compare only these weights"
         )
-    clips = _check(contenders)
-    if clips < 2:
+    clusters = _check(contenders)
+    if clusters < 2:
         raise ValueError(
             "all windows belong to one cluster, so no error over clusters exists; evaluate on more sequences"
         )
     means = np.array([row.mean for row in rows]) * (1 if better == "lower" else -1)
-    deviations = np.stack([row.deviations for row in rows]) * math.sqrt(clips / (clips - 1))
+    deviations = np.stack([row.deviations for row in rows]) * math.sqrt(clusters / (clusters - 1))
     between, rest = (
         np.array([getattr(row, part) if over_seeds else 0.0 for row in rows]) for part in ("seeds", "rest")
     )
     freedom = np.array([min(row.count - 1, 10**9) if over_seeds else 10**9 for row in rows])
 
     random = np.random.default_rng(seed)
-    wider = np.sqrt((clips - 1) / random.chisquare(clips - 1, (draws, 1)))
-    common_errors = wider * (random.standard_normal((draws, clips)) @ deviations.T)
+    wider = np.sqrt((clusters - 1) / random.chisquare(clusters - 1, (draws, 1)))
+    common_errors = wider * (random.standard_normal((draws, clusters)) @ deviations.T)
     variances = np.maximum(between * freedom / random.chisquare(freedom, (draws, len(rows))) - rest, 0)
     errors = common_errors + np.sqrt(variances) * random.standard_normal((draws, len(rows)))
 
@@ -200,10 +200,10 @@ def confidence_set(
 
 
 def _check(rows: Mapping[str, TwoWayErrors]) -> int:
-    """Return the number of clips of comparable scores.
+    """Return the number of clusters of comparable scores.
 
     Raises:
-        ValueError: when scores are on different clips, or not finite.
+        ValueError: when scores are on different clusters, or not finite.
     """
     counts = {name: len(row.deviations) for name, row in rows.items()}
     if len(set(counts.values())) > 1:
@@ -264,21 +264,21 @@ def required(
     level: float = 0.95,
     seeds: Sequence[int] = (2, 3, 4, 5, 7, 10, 15, 20),
 ) -> Requirement:
-    """Return how many training seeds and clips would distinguish two models, from their measured variances.
+    """Return how many training seeds and clusters would distinguish two models, from their measured variances.
 
-    The variances are estimates themselves: with three seeds, a variance may well be off by a factor of two. New clips
-    are assumed to be as long as the present ones.
+    The variances are estimates themselves: with three seeds, a variance may well be off by a factor of two. New
+    clusters are assumed to be as long as the present ones.
 
     Args:
-        first, second: scores of two models on the same clips, with at least two seeds each.
+        first, second: scores of two models on the same clusters, with at least two seeds each.
         difference: difference to detect; the measured one by default.
         power: probability of detecting it.
         level: level of the interval that must exclude 0.
         seeds: numbers of seeds per model in the result.
 
     Raises:
-        ValueError: when a model has one seed, or scores are on different clips or not finite. Also when the difference
-            is 0 or not finite, seeds are below 2, or power or level is not between 0 and 1.
+        ValueError: when a model has one seed, or scores are on different clusters or not finite. Also when the
+            difference is 0 or not finite, seeds are below 2, or power or level is not between 0 and 1.
     """
     if not (0 < power < 1 and 0 < level < 1) or min(seeds, default=0) < 2 or any(int(each) != each for each in seeds):
         raise ValueError(
@@ -294,26 +294,28 @@ def required(
             f"got a difference of {sought} with a standard error of {measured.total}"
         )
     rows = (first, second)
-    rest = [row.rest * row.count * count for row in rows]  # variances of single seeds and clips
+    rest = [row.rest * row.count * count for row in rows]  # variances of single seeds and clusters
     seed_variances = [max(row.count * row.seeds - r / count, 0.0) for row, r in zip(rows, rest, strict=True)]
     common = max(count * measured.sequences**2 - sum(row.rest * count for row in rows), 0.0)
 
-    def reached(clips: int, *numbers: int) -> float:
+    def reached(clusters: int, *numbers: int) -> float:
         """Return the power, averaged over errors and degrees of freedom that `TwoWayErrors.estimate` may return."""
         both = [*zip(rest, seed_variances, numbers, strict=True)]
-        over = (common + sum(r / n for r, _, n in both)) / clips
-        between = [(o + r / clips) / n for r, o, n in both]
-        shared = sum(r / n for r, _, n in both) / clips
-        of_clips, *others = _ranks()
-        clip_variance = over * scipy.special.chdtri(clips - 1, of_clips) / (clips - 1)
+        over = (common + sum(r / n for r, _, n in both)) / clusters
+        between = [(o + r / clusters) / n for r, o, n in both]
+        shared = sum(r / n for r, _, n in both) / clusters
+        of_clusters, *others = _ranks()
+        cluster_variance = over * scipy.special.chdtri(clusters - 1, of_clusters) / (clusters - 1)
         of_seeds = [
             v * scipy.special.chdtri(n - 1, ranks) / (n - 1)
             for v, (*_, n), ranks in zip(between, both, others, strict=True)
         ]
-        total = np.maximum(clip_variance + sum(of_seeds) - shared, np.maximum(clip_variance, sum(of_seeds)))
-        uncertain = clip_variance**2 / (clips - 1) + sum(v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True))
+        total = np.maximum(cluster_variance + sum(of_seeds) - shared, np.maximum(cluster_variance, sum(of_seeds)))
+        uncertain = cluster_variance**2 / (clusters - 1) + sum(
+            v**2 / (n - 1) for v, n in zip(of_seeds, numbers, strict=True)
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
-            freedom = np.maximum(np.nan_to_num(total**2 / uncertain, nan=1e9), min(clips, *numbers) - 1)
+            freedom = np.maximum(np.nan_to_num(total**2 / uncertain, nan=1e9), min(clusters, *numbers) - 1)
         beyond = scipy.special.stdtrit(np.minimum(freedom, 1e9), (1 + level) / 2) * np.sqrt(total)
         scale = math.sqrt(over + sum(o / n for _, o, n in both))
         if not scale:
@@ -337,10 +339,10 @@ def required(
 
 
 FEWEST, MOST_CLIPS = 5, 10**7
-"""Smallest number of clips with an estimate of errors, and the number above which the search for more stops."""
+"""Smallest number of clusters with an estimate of errors, and the number above which the search for more stops."""
 
 
 @cache
 def _ranks() -> np.ndarray:
-    """Return quasi-random ranks of the variances over clips and over two models' seeds, to average the power over."""
+    """Return quasi-random ranks of the variances over clusters and over two models' seeds, to average over."""
     return scipy.stats.qmc.Halton(3, seed=0).random(2000).T

@@ -2,7 +2,7 @@
 
 A result is a dataclass. The annotations of its fields name the dimensions of its arrays:
 
-    frames: Annotated[np.ndarray, Dims("sequence")]
+    n_steps: Annotated[np.ndarray, Dims("sequence")]
     bounds: Annotated[dict[str, np.ndarray], Dims("seed", "sequence", name="{}")]      a variable for each key
     rows: Annotated[dict[str, Row], MODELS]                                            the dimension "model"
 

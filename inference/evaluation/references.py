@@ -27,13 +27,13 @@ _EXACT = "donot_use_mm_for_euclid_dist"
 
 
 def last_places(batch: Batch, observed: int) -> tuple[Tensor, Tensor | None]:
-    """Return the last observed frame `(B, D)`, and a mask of the coordinates that were observed at all (None: all).
+    """Return the last observed step `(B, D)`, and a mask of the coordinates that were observed at all (None: all).
 
-    A coordinate that is missing in the last frame has its last observed value, or 0 if it was never observed.
+    A coordinate that is missing in the last step has its last observed value, or 0 if it was never observed.
 
     Args:
         batch: batch with x `(B, T, D)`, and optionally its mask.
-        observed: O, number of observed frames.
+        observed: O, number of observed steps.
     """
     x, mask = batch["x"][:, :observed], batch.mask()
     if mask is None:
@@ -71,12 +71,12 @@ def distances(
 
 
 def last_value(observed: Tensor, horizon: int, mask: Tensor | None = None) -> Tensor:
-    """Repeat the last observed frame, a forecast that any method should beat.
+    """Repeat the last observed step, a forecast that any method should beat.
 
     Args:
-        observed: observed frames `(B, O, D)`.
-        horizon: H, number of frames to predict.
-        mask: `(B, O, D)`, True where a coordinate was observed; one that is missing in the last frame has its last
+        observed: observed steps `(B, O, D)`.
+        horizon: H, number of steps to predict.
+        mask: `(B, O, D)`, True where a coordinate was observed; one that is missing in the last step has its last
             observed value.
 
     Returns:
@@ -89,9 +89,9 @@ def seasonal(observed: Tensor, horizon: int, season: int, mask: Tensor | None = 
     """Repeat the last observed period.
 
     Args:
-        observed: observed frames `(B, O, D)`.
-        horizon: H, number of frames to predict.
-        season: number of frames in a period, at most O; 1 repeats the last value.
+        observed: observed steps `(B, O, D)`.
+        horizon: H, number of steps to predict.
+        season: number of steps in a period, at most O; 1 repeats the last value.
         mask: `(B, O, D)`, True where a coordinate was observed. A value that is missing in the last period is taken
             from the latest period that has it, or else from linear interpolation in time.
 
@@ -138,8 +138,8 @@ def nearest_neighbours(
     """Return the futures of the training windows whose last observed poses are closest.
 
     Args:
-        observed: observed frames `(B, O, D)`.
-        training: training windows `(N, O + H, D)` with as many observed frames.
+        observed: observed steps `(B, O, D)`.
+        training: training windows `(N, O + H, D)` with as many observed steps.
         samples: K, number of neighbours.
         mask, training_mask: masks of `observed` and `training`, True where a coordinate was observed. Poses are from
             `last_places`, and missing values of futures are interpolated.
@@ -172,9 +172,9 @@ class References:
     |---|---|---|
     | last value | the last observed values repeated | |
     | seasonal | the last period repeated | a season that was observed |
-    | mean | the mean of every column in the training windows, at all frames | training windows |
+    | mean | the mean of every column in the training windows, at all steps | training windows |
     | climatology | K futures of training windows, drawn at random for each window | training windows |
-    | nearest neighbours | the futures of the K training windows with the closest last frames | training windows |
+    | nearest neighbours | the futures of the K training windows with the closest last steps | training windows |
 
     Windows may rename some references by `windows.references`, {new name: name}. The renamed ones are then the default
     rows.
@@ -187,7 +187,7 @@ class References:
         samples: K, number of forecasts.
         seed: seed of the draws.
         training: training windows.
-        season: number of frames in a period; by default from the windows' description.
+        season: number of steps in a period; by default from the windows' description.
 
     Raises:
         ValueError: on indexing, when the reference does not exist or is not available.

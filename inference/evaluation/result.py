@@ -35,7 +35,7 @@ LARGEST = 2**28
 
 
 class Table(rich.table.Table):
-    """Rich table that prints text literally: names of clips, labels and models contain no markup and no emoji."""
+    """Rich table that prints text literally: names of clusters, labels and models contain no markup and no emoji."""
 
     def __init__(self, *, title: str = "", caption: str = "", **options: Any) -> None:
         super().__init__(**options)

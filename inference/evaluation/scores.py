@@ -35,7 +35,7 @@ class Metric:
         unit: unit of the score.
         program: "free-running" or "teacher-forced".
         better: "lower", "higher", or "" for neither.
-        partial: whether the score may be NaN for some clips; its mean then omits them.
+        partial: whether the score may be NaN for some clusters; its mean then omits them.
     """
 
     unit: str = ""
@@ -53,28 +53,28 @@ TEACHER_FORCED = {
 KL = Metric("nats/step", "teacher-forced", "")
 
 
-def clip_means(values: Tensor, clips: Tensor) -> Sequence[Any]:
-    """Return means over the windows of each clip.
+def cluster_means(values: Tensor, clusters: Tensor) -> Sequence[Any]:
+    """Return means over the windows of each cluster.
 
     Args:
         values: score of every window, `(N, ...)`.
-        clips: clip of every window, from 0 to C - 1, `(N,)`.
+        clusters: cluster of every window, from 0 to C - 1, `(N,)`.
     """
-    places = clips.numpy()
+    places = clusters.numpy()
     means: list[Any] = (_sums(values.double().numpy(), places).T / np.bincount(places)).T.tolist()
     return means
 
 
-def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
-    """Return clip values of a score that is NaN for some windows; their mean is the mean over the other windows.
+def means_of_those_that_count(values: Tensor, clusters: Tensor) -> Sequence[Any]:
+    """Return cluster values of a score that is NaN for some windows; their mean is the mean over the other windows.
 
-    The value of a clip is R + N / M (s_c - R m_c) / n_c. Here m_c of its n_c windows have a score, with the sum s_c. M
-    is the number of such windows among all N, and R the mean over these M. This is a linearised ratio of sums, which
-    gives the errors of a ratio (Cochran 1977). All clips are NaN if no window has a score.
+    The value of a cluster is R + N / M (s_c - R m_c) / n_c. Here m_c of its n_c windows have a score, with the sum s_c.
+    M is the number of such windows among all N, and R the mean over these M. This is a linearised ratio of sums, which
+    gives the errors of a ratio (Cochran 1977). All clusters are NaN if no window has a score.
     """
-    places, valid = clips.numpy(), ~values.isnan().numpy()
+    places, valid = clusters.numpy(), ~values.isnan().numpy()
     if not valid.any():
-        return clip_means(values, clips)
+        return cluster_means(values, clusters)
     windows, counts = np.bincount(places), _sums(valid, places)
     sums = _sums(values.nan_to_num().double().numpy(), places)
     ratio = sums.sum(0) / counts.sum(0)
@@ -83,7 +83,7 @@ def means_of_those_that_count(values: Tensor, clips: Tensor) -> Sequence[Any]:
 
 
 def _sums(values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return sums (C, ...) of values (N, ...) over the windows of each clip."""
+    """Return sums (C, ...) of values (N, ...) over the windows of each cluster."""
     columns = values.reshape(len(values), -1).T
     return np.stack([np.bincount(places, weights=each) for each in columns], -1).reshape(-1, *values.shape[1:])
 
@@ -98,9 +98,9 @@ class Measure:
             windows among all; it returns the score `(B,)`, on the CPU. Futures are NaN where they were not observed.
             The past has x `(B, O, D)`, its mask if there is one, and context.
         unit, better, partial: see `Metric`.
-        pool: function of the scores of all windows, `(N, ...)`, and their clips; it returns a value for each clip. The
-            mean of these values, weighted by numbers of windows, is the score. The values are pseudo-values for a score
-            of the whole set, and lists of shares for a histogram.
+        pool: function of the scores of all windows, `(N, ...)`, and their clusters; it returns a value for each
+            cluster. The mean of these values, weighted by numbers of windows, is the score. The values are
+            pseudo-values for a score of the whole set, and lists of shares for a histogram.
         headline: whether the table of a comparison contains it.
         truth: name of a reference row that forecasts the true futures, if the score needs it as a comparison.
         note: line printed below the table.
@@ -120,7 +120,7 @@ class Measure:
     unit: str = ""
     better: str = "lower"
     partial: bool = False
-    pool: Callable[[Tensor, Tensor], Sequence[Any]] = clip_means
+    pool: Callable[[Tensor, Tensor], Sequence[Any]] = cluster_means
     headline: bool = False
     truth: str = ""
     note: str = ""
@@ -335,7 +335,7 @@ def _part(
         unobserved = part(truth).isnan().all(-1).all(-1)
         return scores.masked_fill(unobserved.reshape(-1, *[1] * (scores.ndim - 1)), torch.nan)
 
-    pool = means_of_those_that_count if measure.pool is clip_means else measure.pool
+    pool = means_of_those_that_count if measure.pool is cluster_means else measure.pool
     return replace(measure, function=part_score, pool=pool)
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 class GradNorm:
     """Objective with adaptive weights for named log-likelihoods and energies; `others` weighs all other terms.
 
-    Let L_i be a negative log-likelihood, or an energy, summed over the batch and divided by its number of frames. Then
+    Let L_i be a negative log-likelihood, or an energy, summed over the batch and divided by its number of steps. Then
 
         loss = sum_tasks w_i L_i + others(the other terms).
 
@@ -107,7 +107,7 @@ class GradNorm:
         return loss
 
     def losses(self, terms: "Terms") -> list[Tensor]:
-        """Return the losses of the tasks in their order, scalars, each divided by the number of frames.
+        """Return the losses of the tasks in their order, scalars, each divided by the number of steps.
 
         Args:
             terms: terms of the bound.
@@ -121,7 +121,7 @@ class GradNorm:
                 f"`tasks` includes {', '.join(map(repr, unknown))}, but the log-likelihoods and energies are "
                 f"{', '.join(costs) or 'none'}; set the weights of all other terms in others"
             )
-        return [costs[task].sum() / terms.frames.sum() for task in self.tasks]
+        return [costs[task].sum() / terms.n_steps.sum() for task in self.tasks]
 
     def begin(self, model: nn.Module) -> "Balance":
         """Return the objective for a stage of a run, with its own weights, which start at 1.

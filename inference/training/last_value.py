@@ -36,10 +36,10 @@ _ONE_HOT = type(constraints.one_hot)
 def last_value_bound(
     model: DynamicalVAE, train: Source, validation: Batched, observed: int, *, fed: bool, batch_size: int
 ) -> float:
-    """Return the log density of validation windows under the last-value forecast, in nats per frame.
+    """Return the log density of validation windows under the last-value forecast, in nats per step.
 
     Args:
-        model: model. Its view defines the number of first frames without a score, and its distributions define which
+        model: model. Its view defines the number of first steps without a score, and its distributions define which
             coordinates are discrete.
         train: training windows, for the variances of differences.
         validation: windows to score.

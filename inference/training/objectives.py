@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Objective(Protocol):
-    """Function that returns the loss of a batch, in nats per frame, from its terms."""
+    """Function that returns the loss of a batch, in nats per step, from its terms."""
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
         """Return the loss of a batch at a global step."""
@@ -81,9 +81,9 @@ class AdaptiveObjective(Protocol):
 
 @dataclass(frozen=True)
 class Evidence:
-    """Negative weighted evidence lower bound, in nats per frame.
+    """Negative weighted evidence lower bound, in nats per step.
 
-    Division by the number of frames F makes learning rates independent of sequence length. With sums over the sequences
+    Division by the number of steps F makes learning rates independent of sequence length. With sums over the sequences
     of the batch,
 
         loss = - weight * sum log p / F + sum_latents weight * max(KL / F, free bits)
@@ -91,7 +91,7 @@ class Evidence:
 
     Args:
         kl_weight: weight of the KL terms, a number or a schedule; or one for each latent by name (default 1).
-        free_bits: nats per frame, averaged over the batch, below which a latent's KL is not penalised; a number for all
+        free_bits: nats per step, averaged over the batch, below which a latent's KL is not penalised; a number for all
             latents, or one for each latent by name (default 0).
         energy_weights: weight of each energy by name (default 1).
         likelihood_weight: weight of the log-likelihood. If energies train the locations and the likelihood only the
@@ -124,7 +124,7 @@ class Evidence:
         kl_weight = _by_name("kl_weight", self.kl_weight, terms.kl, default=1.0)
         free_bits = _by_name("free_bits", self.free_bits, terms.kl, default=0.0)
         energy_weights = _by_name("energy_weights", self.energy_weights, terms.energies, default=1.0)
-        frames = terms.frames.sum()
+        frames = terms.n_steps.sum()
         likelihood = sum((value.sum() for value in terms.log_likelihood.values()), frames.new_zeros(()))
         loss = -self.likelihood_weight * likelihood / frames
         for latent, kl in terms.kl.items():

@@ -26,7 +26,7 @@ class Training:
         momentum: momentum of "sgd", the share of the last step that is added to the next one.
         weight_decay: the optimiser's weight decay.
         gradient_clip: largest norm of the gradient of the loss (nats per step); None for no limit.
-        scheduled_sampling: probability that a frame of x's history is replaced by the model's own mean (scheduled
+        scheduled_sampling: probability that a step of x's history is replaced by the model's own mean (scheduled
             sampling, Bengio et al. 2015, arXiv 1506.03099); a number or a schedule. For a model trained on noisy inputs
             (`InputNoise`), the share of that noise. Validation then uses the last value of the schedule, and the best
             weights are selected once the schedule has reached it.

@@ -92,7 +92,7 @@ def sum_over_processes(fabric: "Fabric", value: Tensor) -> Tensor:
 def average_gradients(
     fabric: "Fabric", parameters: Sequence[nn.Parameter], loss: Tensor, frames: Tensor
 ) -> tuple[Tensor, Tensor | float]:
-    """Average gradients over processes, weighted by frames, as for one batch of the sequences of all processes.
+    """Average gradients over processes, weighted by steps, as for one batch of the sequences of all processes.
 
     A parameter that has no gradient in any process remains without one.
 
@@ -100,10 +100,10 @@ def average_gradients(
         fabric: fabric of the processes.
         parameters: trained parameters, after the backward pass.
         loss: loss of this process's batch, a scalar.
-        frames: number of frames in this process's batch, a scalar.
+        frames: number of steps in this process's batch, a scalar.
 
     Returns:
-        The loss of the joint batch, and this process's share of its frames.
+        The loss of the joint batch, and this process's share of its steps.
     """
     if fabric.world_size == 1:
         return loss.detach(), 1.0

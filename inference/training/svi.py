@@ -207,7 +207,7 @@ class SVI:
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # the optimiser skips a parameter without a gradient, and keeps its state
-        total_loss, self._share = processes.average_gradients(self.fabric, self.parameters, loss, terms.frames.sum())
+        total_loss, self._share = processes.average_gradients(self.fabric, self.parameters, loss, terms.n_steps.sum())
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
         # The only synchronisation with the device in a step; all other work is queued.
@@ -233,7 +233,7 @@ class SVI:
         return terms
 
     def row(self) -> dict[str, float]:
-        """Return the numbers of the last step, in nats per frame (see `trackers`).
+        """Return the numbers of the last step, in nats per step (see `trackers`).
 
         Raises:
             RuntimeError: no step has been taken since `init`.
@@ -242,10 +242,10 @@ class SVI:
             raise RuntimeError("no step has been taken since init(); call step() first")
         loss, norm = self._numbers
         rates = self.rates(self.state.step - 1)
-        return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_frame(_sums(self.state.terms))}
+        return {"loss": loss, "gradient_norm": norm, **rates, **self._weights, **_per_step(_sums(self.state.terms))}
 
     def evaluate(self, data: Any) -> dict[str, float]:
-        """Return the terms of the unweighted bound on data, in nats per frame; the model stays in evaluation mode.
+        """Return the terms of the unweighted bound on data, in nats per step; the model stays in evaluation mode.
 
         The draws from the guide are the same at each call, so bounds differ only by the weights. Processes share the
         data, and each returns the terms of all data. The row of a model without a likelihood has a "loss" instead of a
@@ -320,10 +320,10 @@ class SVI:
         return processes.sum_over_processes(self.fabric, value)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Return the mean over processes of a value per frame, weighted by their numbers of frames in the last step.
+        """Return the mean over processes of a value per step, weighted by their numbers of steps in the last step.
 
         Args:
-            value: value per frame of this process.
+            value: value per step of this process.
         """
         return self.total(value * self._share)
 
@@ -353,7 +353,7 @@ class SVI:
         return {"torch": torch.get_rng_state(), **cuda}
 
     def _score(self, data: Batched, feeding: float) -> dict[str, float]:
-        """Return the unweighted terms on held-out data, per frame, with the same draws at each call.
+        """Return the unweighted terms on held-out data, per step, with the same draws at each call.
 
         Args:
             data: held-out data.
@@ -378,11 +378,11 @@ class SVI:
                 terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
                 sums_of_batch = _sums(terms)
                 if not terms.likelihood or (isinstance(objective, RequiresDraws) and objective.select == "loss"):
-                    sums_of_batch["loss"] = objective(terms, last).double() * sums_of_batch["frames"]
+                    sums_of_batch["loss"] = objective(terms, last).double() * sums_of_batch["steps"]
                 for name, value in sums_of_batch.items():
                     sums[name] = sums[name] + value if name in sums else value
         totals = self.total(torch.stack(list(sums.values())) * shares)
-        return _per_frame(dict(zip(sums, totals, strict=True)))
+        return _per_step(dict(zip(sums, totals, strict=True)))
 
     def _terms(
         self, batch: AnyBatch, objective: Objective, location: str, feeding: float, curriculum: float | None = None
@@ -438,26 +438,26 @@ class _Bound(nn.Module):
         terms = self.estimator.terms(self.model, batch(), **program)
         # measured here, because outside only fabric may compute gradients of the module's output
         if measure is not None and torch.is_grad_enabled():
-            with torch.autocast(terms.frames.device.type, enabled=False):
+            with torch.autocast(terms.n_steps.device.type, enabled=False):
                 measure(terms)
         return dict(vars(terms))
 
 
 def _sums(terms: Terms) -> dict[str, Tensor]:
-    """Return the sum of each term over the sequences of a batch, and the number of frames."""
+    """Return the sum of each term over the sequences of a batch, and the number of steps."""
     values = {
         **({"bound": terms.bound} if terms.likelihood else {}),
         **{f"log_likelihood/{name}": value for name, value in terms.log_likelihood.items()},
         **{f"kl/{name}": value for name, value in terms.kl.items()},
         **{f"energy/{name}": value for name, value in terms.energies.items()},
-        "frames": terms.frames,
+        "steps": terms.n_steps,
     }
     return {name: value.detach().double().sum() for name, value in values.items()}
 
 
-def _per_frame(sums: Mapping[str, Tensor]) -> dict[str, float]:
-    rates = (torch.stack(list(sums.values())) / sums["frames"]).tolist()
-    return {name: rate for name, rate in zip(sums, rates, strict=True) if name != "frames"}
+def _per_step(sums: Mapping[str, Tensor]) -> dict[str, float]:
+    rates = (torch.stack(list(sums.values())) / sums["steps"]).tolist()
+    return {name: rate for name, rate in zip(sums, rates, strict=True) if name != "steps"}
 
 
 def _describe_non_finite(model: nn.Module, terms: Terms, loss: Tensor) -> str:

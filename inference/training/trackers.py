@@ -1,6 +1,6 @@
 """Trackers, which receive the log of a run: a list, a file of JSON lines, TensorBoard or the terminal.
 
-A row maps names to numbers, in nats per frame. `bound`, `log_likelihood/x` and `kl/z` are of a training batch, and with
+A row maps names to numbers, in nats per step. `bound`, `log_likelihood/x` and `kl/z` are of a training batch, and with
 the prefix `validation/` of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling`
 describe the step, as does `weight/x` for an objective with adaptive weights.
 """

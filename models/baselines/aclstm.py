@@ -32,8 +32,8 @@ class ACLSTM(DeterministicMethod):
     """The auto-conditioned LSTM.
 
     Args:
-        shown: number of frames of the data in a block.
-        own: number of frames of the network's own output in the following block.
+        data_frames: number of frames of the data in a block.
+        output_frames: number of frames of the network's own output in the following block.
         scheduled_sampling: probability that a frame of the second block is the network's own output instead of the
             data.
     """
@@ -49,8 +49,8 @@ class ACLSTM(DeterministicMethod):
     }
 
     layers: Layers = 3
-    shown: Size = 5
-    own: Size = 5
+    data_frames: Size = 5
+    output_frames: Size = 5
     scheduled_sampling: Share = 1.0
 
     @override
@@ -60,7 +60,7 @@ class ACLSTM(DeterministicMethod):
 
     @override
     def fed(self) -> ScheduledSampling:
-        return ScheduledSampling(0.0, gradient=True, blocks=(self.shown, self.own))
+        return ScheduledSampling(0.0, gradient=True, blocks=(self.data_frames, self.output_frames))
 
     @override
     def _feeding(self, steps: int) -> Schedule | float:

@@ -8,11 +8,11 @@ N(0, I), plus the similarity of the futures, plus the squared error of the best 
 
     beta mean_k KL(N(b_k, diag a_k^2) || N(0, I)) + lambda mean_{i<j} exp(-||x^i - x^j||^2 / s) + 2 min_k ||x^k - x||^2
 
-Distances are over all frames and coordinates. If parts of the body are held, only the other joints should differ. The
-loss then includes the squared distance of the held joints from their positions in the first mode.
+Distances are over all frames and coordinates. If parts of the body are fixed, only the other joints should differ. The
+loss then includes the squared distance of the fixed joints from their positions in the first mode.
 
 Yuan and Kitani, 2020, arXiv 2003.08386, with the normalisation of its public code. For Human3.6M, the network has
-2,038,528 parameters with 10 modes and 7,291,648 with 50 modes, without the decoder. Our choices are the weight of held
+2,038,528 parameters with 10 modes and 7,291,648 with 50 modes, without the decoder. Our choices are the weight of fixed
 joints, the heading, and lambda and s for other data. For lambda and s we use the values of HumanEva, whose windows have
 as many frames.
 """
@@ -61,9 +61,9 @@ class DLow(ModesMethod):
         diversity_scale: s, scale of squared distances between futures, in square metres; two futures at this distance
             have similarity 1 / e.
         reconstruction: weight of the squared error of the best future.
-        held: parts of the body, or joints, with the same motion in all modes, such as "lower".
-        hold: weight of the squared distance of held joints from their positions in the first mode, averaged over the
-            other modes.
+        fixed: parts of the body, or joints, with the same motion in all modes, such as "lower".
+        fixed_weight: weight of the squared distance of fixed joints from their positions in the first mode, averaged
+            over the other modes.
     """
 
     name = "dlow"
@@ -76,8 +76,8 @@ class DLow(ModesMethod):
     diversity: Amount | None = None
     diversity_scale: Positive | None = None
     reconstruction: Amount = 2.0
-    held: tuple[str, ...] = ()
-    hold: Amount = 10.0
+    fixed: tuple[str, ...] = ()
+    fixed_weight: Amount = 10.0
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -103,7 +103,7 @@ class DLow(ModesMethod):
             raise ValueError("the weights depend on the skeleton; call method.resolve_defaults(windows) first")
         weights = {"reconstruction": self.reconstruction, "kl": self.beta, "diversity": self.diversity}
         weights |= {"join": self.join} if self.join else {}
-        weights |= {"held": self.hold} if self.held else {}
+        weights |= {"fixed": self.fixed_weight} if self.fixed else {}
         draws = {MODE: self.modes or 0}
         return Evidence(energy_weights=weights, likelihood_weight=0.0, draws=draws, select="loss")
 
@@ -115,17 +115,17 @@ class DLowModel(ModesModel):
 
     def __init__(self, method: DLow, frames: int, skeleton: Skeleton | None, **options: Any) -> None:
         super().__init__(method, frames, skeleton, **options)
-        if method.held and skeleton is None:
+        if method.fixed and skeleton is None:
             raise SchemaError(
-                f"held names {', '.join(method.held)}, but the data have no skeleton; fit dlow to windows of poses"
+                f"fixed names {', '.join(method.fixed)}, but the data have no skeleton; fit dlow to windows of poses"
             )
-        held_joints = set(places_of(skeleton, method.held)) if skeleton else set()
+        fixed_joints = set(places_of(skeleton, method.fixed)) if skeleton else set()
         parts = [
-            [c for c in range(self.sizes[WHOLE]) if (c // 3 in held_joints) == is_held] for is_held in (True, False)
+            [c for c in range(self.sizes[WHOLE]) if (c // 3 in fixed_joints) == is_fixed] for is_fixed in (True, False)
         ]
-        self.held, self.free = parts
+        self.fixed, self.free = parts
         if not self.free:
-            raise ValueError(f"held names {', '.join(method.held)}, which are all joints; leave some joints free")
+            raise ValueError(f"fixed names {', '.join(method.fixed)}, which are all joints; leave some joints free")
 
     @override
     def penalties(self, rollout: Rollout, data: Batch, draws: Mapping[str, int]) -> dict[str, Tensor]:
@@ -140,8 +140,8 @@ class DLowModel(ModesModel):
         futures = rollout.parameters(WHOLE, rollout.values[WHOLE])[0].unflatten(0, (self.modes, -1))
         free_motion = futures.index_select(-1, indices(self.free, futures))
         penalties["diversity"] = energies.gaussian_diversity(free_motion, self.method.diversity_scale or 1.0)
-        if self.held:
-            held_motion = futures.index_select(-1, indices(self.held, futures))
-            distances = (held_motion - held_motion[:1]).square().sum((2, 3))
-            penalties["held"] = distances.sum(0) / max(self.modes - 1, 1)
+        if self.fixed:
+            fixed_motion = futures.index_select(-1, indices(self.fixed, futures))
+            distances = (fixed_motion - fixed_motion[:1]).square().sum((2, 3))
+            penalties["fixed"] = distances.sum(0) / max(self.modes - 1, 1)
         return penalties

@@ -154,7 +154,7 @@ def start_flow(model: DynamicalVAE, windows: Any) -> None:
         parameters = run.parameters(WHOLE, x)
     mask, centred = run.mask(WHOLE), model.generator[WHOLE].centred(x)
     parts = (
-        distribution.each(parameters)
+        distribution.split(parameters)
         if isinstance(distribution, ProductModule)
         else [(distribution, list(range(x.shape[-1])), parameters)]
     )

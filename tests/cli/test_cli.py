@@ -366,7 +366,7 @@ def test_a_method_with_a_custom_objective_resumes(people, tmp_path, monkeypatch)
         name: ClassVar[str] = "plain"
 
         def objective(self):
-            return lambda terms, step: (steps.append(step), -terms.bound.sum() / terms.frames.sum())[1]
+            return lambda terms, step: (steps.append(step), -terms.bound.sum() / terms.n_steps.sum())[1]
 
     methods = {**dvae.methods(), "plain": Plain}
     monkeypatch.setattr("dvae.models.registry.methods", lambda: methods)
@@ -611,7 +611,7 @@ def test_prediction_bands_are_calibrated_on_validation_windows_or_labelled_clips
     assert "too short for one: short" in capsys.readouterr().err
     assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5"]) == 0
     data = dvae.load(run).data
-    assert dvae.PredictionBands.load(run / "coverage.json").clips == len(data.windows("validation").clips)
+    assert dvae.PredictionBands.load(run / "coverage.json").clusters == len(data.windows("validation").clips)
     options = [
         "--label",
         "style",
@@ -625,7 +625,7 @@ def test_prediction_bands_are_calibrated_on_validation_windows_or_labelled_clips
     assert main(["check", "coverage", str(run), "--samples", "4", "--level", ".5", *options]) == 0
     assert "calibrated 50 %, future" in capsys.readouterr().out
     test = data.windows("test").clips
-    assert dvae.PredictionBands.load(tmp_path / "a.json").clips == sum(clip.labels["style"] == "a" for clip in test)
+    assert dvae.PredictionBands.load(tmp_path / "a.json").clusters == sum(clip.labels["style"] == "a" for clip in test)
     assert (tmp_path / "a.png").stat().st_size
     for arguments, message in (
         (["--label", "style"], "select the test clips for calibration; give both"),

@@ -123,7 +123,7 @@ def test_windows_of_mapped_motion_equal_those_in_memory(tmp_path, monkeypatch, k
             ]
             assert fingerprints[0] == fingerprints[1]
     assert torch.equal(mapped_windows.poses(), windows.poses())
-    assert all(is_mapped(clip.positions) for clip in mapped_people.divided())
+    assert all(is_mapped(clip.positions) for clip in mapped_people.assign_splits())
 
 
 def test_mapped_arrays_are_valid_sequences(tmp_path):

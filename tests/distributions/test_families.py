@@ -178,7 +178,7 @@ def test_a_product_has_the_densities_and_means_of_its_parts():
     distribution = MIXED.build(Shape(4, 5)).double()
     parameters = distribution(torch.randn(2, 3, 5, dtype=torch.float64))
     value = distribution.draw(parameters, distribution.noise((2, 3, 4), parameters[0]))
-    product, parts = distribution.distribution(parameters), distribution.each(parameters)
+    product, parts = distribution.distribution(parameters), distribution.split(parameters)
     for part, indices, part_parameters in parts:
         expected = part.distribution(part_parameters).log_prob(value[..., indices])
         torch.testing.assert_close(product.log_prob(value)[..., indices], expected)

@@ -100,7 +100,7 @@ def test_alternatives_list_their_costs():
     alternatives = dvae.alternatives("p(w) p(u_t | w) p(z_t | z_{t-1}, u_t) p(x_t | z_t)")
     texts = {entry.inference.text for entry in alternatives.guides}
     assert len(texts) == len(alternatives) == len(alternatives.guides)
-    loops = [bool(entry.looped) for entry in alternatives.guides]
+    loops = [bool(entry.sequential) for entry in alternatives.guides]
     assert loops == sorted(loops)
     for entry in alternatives.guides:
         assert entry.edges == entry.inference.dag(alternatives.steps).number_of_edges()

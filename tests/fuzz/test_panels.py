@@ -107,7 +107,7 @@ def read(example, directory: Path):
     path.write_bytes(content)
     try:
         data = PanelData.open(path)
-        reopened = PanelData.reopened(data.recorded(), data.schema)
+        reopened = PanelData.reopen(data.recorded(), data.schema)
         assert reopened.fingerprint == data.fingerprint
         batch = data.windows("train").all()
         assert all(value.isfinite().all() for value in batch.values())

@@ -393,7 +393,7 @@ def test_declared_missing_marks_and_decimal_signs_are_read(tmp_path):
     data = PanelData.open(tmp_path / "a.csv")  # a schema without columns: they are inferred
     assert data.panel.columns.columns[1].classes == ("rain", "sun")
     np.testing.assert_array_equal(data.panel.series[0].values[:3], [[1.234, np.nan], [np.nan, 1], [5.678, 0]])
-    reopened = PanelData.reopened(data.recorded(), data.schema)
+    reopened = PanelData.reopen(data.recorded(), data.schema)
     assert reopened.fingerprint == data.fingerprint
 
 

@@ -305,7 +305,7 @@ def test_each_sequence_has_one_group_and_one_split():
         ([np.zeros((3, 2)), np.zeros((4, 3))], r"sequence '1' of panel has shape \(4, 3\); expected rows of 2 columns"),
         (np.zeros((2, 0, 3)), r"shape \(0, 3\)"),
         (pd.DataFrame(np.zeros((2, 2)), columns=["a", "a"]), "two columns 'a'"),
-        (pd.DataFrame({"a": [1.0]}).iloc[:0], "the table has no rows"),
+        (pd.DataFrame({"a": [1.0]}).iloc[:0], "a header but no rows"),
         (np.zeros((6, 1), "datetime64[D]"), "array of date.*; give a pandas frame with the times in one column"),
         ({"a": [1]}, "got dict"),
     ],

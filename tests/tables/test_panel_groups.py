@@ -55,7 +55,7 @@ def test_standard_errors_are_over_groups_if_sequences_share_a_latent(data):
     comparison = dvae.compare({"ours": model}, test, particles=5, contrasts=0, **options)
     assert "windows of 3 groups" in str(comparison)
     assert "clustered by group" in str(comparison)
-    groups = np.unique([group for _, group, _ in test.clusters], return_inverse=True)[1]
+    groups = np.unique([group for _, group, _ in test.cluster_keys], return_inverse=True)[1]
     bounds = comparison.rows["ours"].bounds["IWAE bound"][0]
     means = np.bincount(groups, bounds) / np.bincount(groups) / test.length
     assert comparison["ours"]["IWAE bound"].sequences == pytest.approx(means.std(ddof=1) / 3**0.5, rel=1e-6)
@@ -65,7 +65,7 @@ def test_standard_errors_are_over_groups_if_sequences_share_a_latent(data):
     assert "over whole sequences (clustered by group)" in bounds
     scores = dvae.evaluate({"ours": model}, test, training_windows=data.windows("train"), **options)
     assert "windows of 3 groups" in str(scores)
-    assert len(scores.rows["ours"].clip_means["CRPS"]) == 3
+    assert len(scores.rows["ours"].cluster_means["CRPS"]) == 3
     assert np.isfinite(scores["ours"]["CRPS"].standard_error)
 
 

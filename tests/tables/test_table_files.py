@@ -195,13 +195,13 @@ def test_data_are_reopened_from_the_record_of_a_run(tmp_path, monkeypatch):
     rows().to_csv(tmp_path / "riders.csv", index=False)
     monkeypatch.chdir(tmp_path)
     data = PanelData.open("riders.csv", ["riders"], past=("temp",), observed=4, horizon=2)
-    reopened = PanelData.reopened(data.recorded(), data.schema)
+    reopened = PanelData.reopen(data.recorded(), data.schema)
     assert reopened.fingerprint == data.fingerprint == data.recorded().fingerprint
     assert data.recorded().path == "riders.csv"
     assert Path(data.location) == tmp_path / "riders.csv"
     assert reopened.windows("test").fingerprint == data.windows("test").fingerprint
     rows(1).to_csv(tmp_path / "other.csv", index=False)
-    other = PanelData.reopened(data.recorded(), data.schema, "other.csv")
+    other = PanelData.reopen(data.recorded(), data.schema, "other.csv")
     assert other.schema == data.schema
     assert other.fingerprint != data.fingerprint
 

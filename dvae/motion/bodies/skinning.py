@@ -145,7 +145,7 @@ class Body(nn.Module):
         # added last, because rounding errors grow with the distance from the origin
         return vertices + translation[..., None, :], joints + translation[..., None, :]
 
-    def some(self, shape: Tensor, rotations: Tensor, translation: Tensor, vertices: Tensor) -> Tensor:
+    def select_vertices(self, shape: Tensor, rotations: Tensor, translation: Tensor, vertices: Tensor) -> Tensor:
         """Return some vertices of moving bodies, differentiable like `forward`.
 
         Args:

@@ -84,7 +84,7 @@ class Clip:
         truth = {k: v[start:end] if v.shape[:1] == (self.frames,) else v for k, v in self.truth.items()}
         return replace(self, positions=self.positions[start:end], rotations=rotations, truth=truth)
 
-    def resampled(self, ratio: float) -> Clip:
+    def resample(self, ratio: float) -> Clip:
         """Return the clip with one frame for every `ratio` frames; `ratio` may be fractional.
 
         A whole ratio keeps every `ratio`-th frame. Otherwise, positions are interpolated linearly and rotations along
@@ -339,7 +339,7 @@ class MotionSet:
             object.__setattr__(self, "_with_rotations", result)
         return result
 
-    def loosened(self) -> MotionSet:
+    def with_extra_joints(self) -> MotionSet:
         """Return the same positions with extra joints where bones that share a joint move relative to each other.
 
         A joint has one rotation, which moves all its children together. Recordings may omit joints, for example where
@@ -380,8 +380,8 @@ class MotionSet:
         groups = nx.connected_components(nx.from_numpy_array(varies < STIFF))
         return sorted(([joints[index] for index in sorted(group)] for group in groups), key=len, reverse=True)
 
-    def resampled(self, fps: float) -> MotionSet:
-        """Return the same motion at another frame rate, as `Clip.resampled` does.
+    def resample(self, fps: float) -> MotionSet:
+        """Return the same motion at another frame rate, as `Clip.resample` does.
 
         Args:
             fps: new frame rate, in frames per second.
@@ -392,9 +392,9 @@ class MotionSet:
         if not 0 < fps < 1e6:
             raise ValueError(f"`fps` must be above 0 and below 1e6 frames per second, got {fps}")
         ratio, skeleton = self.skeleton.fps / fps, replace(self.skeleton, fps=float(fps))
-        return replace(self, clips=[clip.resampled(ratio) for clip in self], skeleton=skeleton)
+        return replace(self, clips=[clip.resample(ratio) for clip in self], skeleton=skeleton)
 
-    def divided(self, test: float = 0.2, shortest: int = 1) -> MotionSet:
+    def assign_splits(self, test: float = 0.2, shortest: int = 1) -> MotionSet:
         """Return the same motion in the splits "train" and "test", for recordings without splits.
 
         The last part of every clip becomes a test clip if both parts have at least `shortest` frames. If no clip is

@@ -45,7 +45,7 @@ def apply_splits(motion: MotionSet, protocol: Protocol) -> MotionSet:
     """Return motion divided into "train" and "test" if the protocol needs these splits and the motion has neither."""
     needs_splits = (protocol.split_by, protocol.train, protocol.test) == ("split", ("train",), ("test",))
     if needs_splits and not {"train", "test"} & {*motion.splits}:
-        return motion.divided(shortest=protocol.length)
+        return motion.assign_splits(shortest=protocol.length)
     return motion
 
 
@@ -107,7 +107,8 @@ class MotionData:
         Args:
             path: file or folder that `read_motion` reads, or "simulated" for `simulate()`.
             protocol: one of `dvae.motion.PROTOCOLS` or its name; default: `default_protocol` of the clips. If the
-                protocol needs the splits "train" and "test" and no clip has either, `MotionSet.divided` creates them.
+                protocol needs the splits "train" and "test" and no clip has either, `MotionSet.assign_splits` creates
+                them.
             skip_bad: leave out unusable clips instead of raising an error.
             missing: keep clips in which joints are missing (NaN) in some frames.
             representation: input of the models; overrides the representation of the protocol.
@@ -178,11 +179,11 @@ class MotionData:
         return Poses.from_data(self.protocol, motion.skeleton)
 
     def recorded(self) -> Recordings:
-        """Return the record of these data that `reopened` reads."""
+        """Return the record of these data that `reopen` reads."""
         return Recordings(self.path, self.fingerprint, self.skip_bad, self.motion.missing)
 
     @classmethod
-    def reopened(cls, source: Recordings, schema: Poses, path: str | os.PathLike[str] | None = None) -> Self:
+    def reopen(cls, source: Recordings, schema: Poses, path: str | os.PathLike[str] | None = None) -> Self:
         """Open recorded data again, from the recorded path or from another one.
 
         The content of the file may have changed since it was recorded. Data with another skeleton are mapped to the

@@ -267,7 +267,7 @@ def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int
     if motion.skeleton.fps != protocol.fps:
         raise ValueError(
             f"protocol {protocol.name} needs {protocol.fps:g} frames per second, but {motion.name!r} has "
-            f"{motion.skeleton.fps:g}; resample the motion with `MotionSet.resampled`, or choose another protocol"
+            f"{motion.skeleton.fps:g}; resample the motion with `MotionSet.resample`, or choose another protocol"
         )
     parts = _divide(motion, protocol)
     unknown = [name for name in split.split("+") if name not in parts]
@@ -636,7 +636,11 @@ class Windows:
     @property
     def description(self) -> dict[str, Any]:
         """Names of all joints and of the joints whose paths are given, for the record of an evaluation."""
-        description: dict[str, Any] = {"joints": list(self.skeleton.names), "title": [], "called": ["clip", "frame"]}
+        description: dict[str, Any] = {
+            "joints": list(self.skeleton.names),
+            "title": [],
+            "axis_names": ["clip", "frame"],
+        }
         if (given := self.given_joints) is not None:
             description |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
         return description

@@ -197,7 +197,7 @@ class _Stream:
             raise EOFError(f"expected {size:,} more bytes, but only {self.left:,} are left")
         return self._count(self._buffered.read(size))
 
-    def some(self, size: int) -> bytes:
+    def read_up_to(self, size: int) -> bytes:
         """Return `size` bytes, or all remaining ones."""
         return self.read(min(size, self.left))
 
@@ -244,7 +244,7 @@ class Member:
         if self._mapped is not None:
             return self._mapped
         with self._open() as stream:
-            dtype, shape, order = header(stream.some)
+            dtype, shape, order = header(stream.read_up_to)
             if dtype.hasobject:
                 raise NpyError(
                     "contains pickled objects, which only a member called positions_3d may; save numbers or text"
@@ -265,7 +265,7 @@ class Member:
             ValueError: it is damaged, it has other content, or its pickle contains anything but data.
         """
         with self._open() as stream:
-            dtype, shape, _ = header(stream.some)
+            dtype, shape, _ = header(stream.read_up_to)
             if not dtype.hasobject or shape != ():
                 raise NpyError(
                     f"has shape {shape} and dtype {dtype}, expected one pickled dictionary (shape () and dtype object)"

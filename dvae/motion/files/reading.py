@@ -108,7 +108,7 @@ def read_motion(
             {"name in the file": "name in the skeleton"}.
         metres: length of the file's unit in metres, instead of the inferred one.
         up: up axis of the file, "y" or "z", instead of the inferred one.
-        fps: true frames per second, if the file states a wrong rate; `MotionSet.resampled` changes the frame rate.
+        fps: true frames per second, if the file states a wrong rate; `MotionSet.resample` changes the frame rate.
         missing: keep clips in which joints are missing (NaN) in some frames.
 
     Returns:
@@ -233,7 +233,7 @@ class FileReader:
         given: whether the unit of `world` overrides the unit in a file.
         up: whether the up axis of `world` overrides the up axis in a file.
         fps, skeleton, joints, onto: same as in `read_motion`.
-        resampled: frames per second of the result; default: the rate of the file.
+        output_fps: frames per second of the result; default: the rate of the file.
         missing: whether joints may be missing.
     """
 
@@ -244,7 +244,7 @@ class FileReader:
     skeleton: Skeleton | None = None
     joints: Sequence[int | str] | Mapping[str, str] | None = None
     onto: Skeleton | None = None
-    resampled: float | None = None
+    output_fps: float | None = None
     missing: bool = False
 
     def __call__(self, file: File, recording: Recording | None = None) -> tuple[Clip, Skeleton, list[str]]:
@@ -286,8 +286,8 @@ class FileReader:
             normalised = normalised if same_tree else replace(normalised, rotations=None, offsets=None)
         empty = Clip(file.split, file.name, np.empty((0, 0, 3)), file.labels)
         clip, tree = clip_of(normalised, empty, fps, skeleton, self.joints, self.onto)
-        if self.resampled and self.resampled != fps:
-            clip, tree = clip.resampled(fps / self.resampled), replace(tree, fps=float(self.resampled))
+        if self.output_fps and self.output_fps != fps:
+            clip, tree = clip.resample(fps / self.output_fps), replace(tree, fps=float(self.output_fps))
         if reason := defect(clip, tree, self.missing):
             raise ValueError(reason)
         notes = [*recording.notes, *([BENDS] if normalised.rotations is not None and clip.rotations is None else [])]

@@ -188,7 +188,7 @@ def convert(
         options: Any = {"metres": metres, "up": up, "fps": recorded, "missing": missing}
         motions = [read_motion(source, skip_bad=skip_bad, onto=onto, **options) for source in sources]
         motion = motions[0] if len(motions) == 1 else joined_motion([*zip(sources, motions, strict=True)], out.stem)
-        motion = motion if fps is None else motion.resampled(fps)
+        motion = motion if fps is None else motion.resample(fps)
         paths = write_motion(out, motion, format)
         return f"{len(motion)} clips in {len(paths)} files; {len(motion.skipped)} skipped"
     if out.suffix and format != "npz" and len(files) > 1:
@@ -198,7 +198,7 @@ def convert(
         repeated = next(key for key in keys if keys.count(key) > 1)
         raise ValueError(f"two files have the clip name {'/'.join(repeated)}; put them into folders of different names")
     world = infer_world(sampled(files, skip_bad), metres, up)
-    reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, resampled=fps, missing=missing)
+    reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, output_fps=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
 
     def clips(stage: Path) -> Iterator[Clip]:

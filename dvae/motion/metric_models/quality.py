@@ -48,7 +48,7 @@ from ...data.units import Units
 from ...inference.evaluation.estimates import Estimate, TwoWayErrors
 from ...inference.evaluation.evaluation_windows import (
     EvaluationWindows,
-    clip_index,
+    cluster_index,
     on_device_of,
     prepare_windows,
     refuse_non_finite,
@@ -57,7 +57,7 @@ from ...inference.evaluation.evaluation_windows import (
 from ...inference.evaluation.record import MODELS, Dims, plain
 from ...inference.evaluation.references import last_value
 from ...inference.evaluation.result import Result, Table, progress_bar
-from ...inference.evaluation.scores import clip_means
+from ...inference.evaluation.scores import cluster_means
 from ...inference.training.fit import fit
 from ...inference.training.options import Stage
 from ...inference.training.recipe import Recipe, Trainable
@@ -325,7 +325,7 @@ def quality(
         raise ValueError(f"quality needs at least one example and one seed, got {examples} and {list(seeds)}")
     if references and STILL in models:
         raise ValueError(f"the name {STILL!r} is reserved for the zero-velocity baseline; rename the model")
-    test_windows, clips = prepare_windows(test), clip_index(test.keys)
+    test_windows, clips = prepare_windows(test), cluster_index(test.keys)
     batch = train.sample(examples, torch.Generator().manual_seed(seed))
     train_windows = EvaluationWindows(
         train, batch, test_windows.observed, [(train.split, "drawn", n) for n in range(examples)]
@@ -351,7 +351,7 @@ def quality(
                 _classified_as_real(metric_model, x) for x in (test_examples.real, test_examples.generated)
             )
             for score, values in zip(SCORES, ((1 - real + generated) / 2, generated), strict=True):
-                scores[score].append(clip_means(100 * values, clips))
+                scores[score].append(cluster_means(100 * values, clips))
         rows[name] = {score: np.array(values) for score, values in scores.items()}
     record = {
         "classifier": method.config(),
@@ -363,7 +363,7 @@ def quality(
         "trained on": train.fingerprint,
         "protocol": asdict(test.protocol),
     }
-    return QualityScores(rows, test_windows.clips, plain(record))
+    return QualityScores(rows, test_windows.clusters, plain(record))
 
 
 def _forecaster(model: Any, horizon: int, options: Mapping[str, Any]) -> Callable[[Batch], Tensor]:

@@ -87,7 +87,7 @@ def draw_traversal(
 
     order = traversal.effect.argsort(descending=True, stable=True)[:rows]
     skeleton = windows.skeleton
-    poses = windows.positions(traversal.frames[order, :, sequence])[:, :, frame].double().cpu()
+    poses = windows.positions(traversal.decoded[order, :, sequence])[:, :, frame].double().cpu()
     poses = poses - poses[..., skeleton.root : skeleton.root + 1, :]
     middle = int(traversal.offsets.abs().argmin())
     azimuth = math.pi / 5 - final_heading(skeleton, poses[0, middle : middle + 1])

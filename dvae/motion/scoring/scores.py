@@ -53,7 +53,7 @@ from ...constants import indices
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, interpolate_missing, mean_of_known
 from ...inference.evaluation import metrics
-from ...inference.evaluation.evaluation_windows import clip_index, on_device_of, seeded_evaluation
+from ...inference.evaluation.evaluation_windows import cluster_index, on_device_of, seeded_evaluation
 from ...inference.evaluation.scores import ENERGY, VARIOGRAM, Measure, means_of_those_that_count, paired
 from ..data.exchange import ExchangedWindows
 from ..data.protocols import Windows
@@ -466,7 +466,7 @@ def _labels(name: str, classifier: Any, windows: Windows | ExchangedWindows) -> 
             f"the classifier {name} was fitted to {expected[0]} predicted frames at {expected[1]:g} fps; these windows "
             f"have {actual[0]} at {actual[1]:g}"
         )
-    clips = clip_index(windows.keys).bincount()
+    clips = cluster_index(windows.keys).bincount()
     if len(windows.keys) - (int(clips.max()) if len(clips) > 1 else 0) < 2:
         raise ValueError(
             f"FID {name} fits normal distributions to features, and needs at least two windows when any one clip is "

@@ -204,16 +204,16 @@ class SegmentCompletion:
         rotations, places = self.model.timed.poses(frames)
         pose, decoded = (shape, rotations, places), {}
         if SURFACES in observations:
-            decoded[SURFACES] = body.some(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
+            decoded[SURFACES] = body.select_vertices(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
         if SPOTS in observations:
-            decoded[SPOTS] = body.some(*pose, torch.tensor(self.markers, device=z.device))
+            decoded[SPOTS] = body.select_vertices(*pose, torch.tensor(self.markers, device=z.device))
         if POINTS in observations:
             vertices = (
                 observations[NEAREST]
                 if NEAREST in observations
                 else nearest_vertices(body, *pose, observations[POINTS])
             )
-            decoded[POINTS] = body.some(*pose, vertices)
+            decoded[POINTS] = body.select_vertices(*pose, vertices)
         return times, decoded
 
     def _at_moments(self, z: Tensor, shape: Tensor, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
@@ -411,7 +411,7 @@ def simulate_observations(
         observations = {FRAMES: torch.tensor(frames).to(x).expand(len(x), -1)}
     rotations, places = model.timed.poses(_at_moments(model.timed, x, observations)[0])
     if kind == SPOTS:
-        positions = model.body.some(shape, rotations, places, torch.tensor(markers))
+        positions = model.body.select_vertices(shape, rotations, places, torch.tensor(markers))
     else:
         positions = model.body(shape, rotations, places)[0]
         if kind == POINTS:

@@ -114,7 +114,7 @@ class SegmentData:
         motion = simulate() if name == SIMULATED else read_motion(name, skip_bad=skip_bad)
         if not {"train", "test"} & {*motion.splits}:
             longest = max(clip.frames for clip in motion)
-            motion = motion.divided(shortest=1 if len(motion) == 1 else longest + 1)
+            motion = motion.assign_splits(shortest=1 if len(motion) == 1 else longest + 1)
         return cls(name, motion, skip_bad=skip_bad, **options)
 
     @property
@@ -196,11 +196,11 @@ class SegmentData:
         return Segments(replace(self.segments, clips=clips), self.timed)
 
     def recorded(self) -> SegmentSource:
-        """Return the record of these data that `reopened` reads."""
+        """Return the record of these data that `reopen` reads."""
         return SegmentSource(self.path, self.fingerprint, self.cut, self.skip_bad, self.bodies)
 
     @classmethod
-    def reopened(cls, source: SegmentSource, schema: SegmentSchema, path: str | os.PathLike[str] | None = None) -> Self:
+    def reopen(cls, source: SegmentSource, schema: SegmentSchema, path: str | os.PathLike[str] | None = None) -> Self:
         """Open the data of a run again, with the run's conversion to frames.
 
         The fingerprint is not compared, so the content of the file may have changed.

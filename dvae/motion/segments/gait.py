@@ -145,7 +145,7 @@ def on_common_joints(first: MotionSet, second: MotionSet) -> tuple[MotionSet, Mo
     """Return the motion of two sources on their common joints, to train on one and test on the other.
 
     Both results have the same joint tree: the tree of the first source without the joints that the second does not
-    have. `MotionSet.loosened` adds joints where bones move relative to each other in either source.
+    have. `MotionSet.with_extra_joints` adds joints where bones move relative to each other in either source.
 
     Args:
         first, second: motion with some joint names in common.
@@ -164,7 +164,7 @@ def on_common_joints(first: MotionSet, second: MotionSet) -> tuple[MotionSet, Mo
     marked = [
         replace(clip, split=f"{n}{clip.split}", rotations=None) for n, motion in enumerate(both) for clip in motion
     ]
-    loose = MotionSet(marked, replace(selected.skeleton, rest=(), lengths=()), copy=False).loosened()
+    loose = MotionSet(marked, replace(selected.skeleton, rest=(), lengths=()), copy=False).with_extra_joints()
     motions = []
     for n, motion in enumerate(both):
         clips = [replace(clip, split=clip.split[1:]) for clip in loose if clip.split[0] == str(n)]
@@ -285,7 +285,7 @@ def _at_rate(clip: Clip, fps: float, rate: float) -> tuple[Clip, float]:
         raise ValueError(
             f"clip {'/'.join(clip.key)} has no rotations of joints; MotionSet.with_rotations() computes them"
         )
-    return (clip, 1.0) if fps == rate else (clip.resampled(fps / rate), fps / rate)
+    return (clip, 1.0) if fps == rate else (clip.resample(fps / rate), fps / rate)
 
 
 @lru_cache(maxsize=8)

@@ -23,10 +23,10 @@ from ...data.batch import WHOLE, Batch
 from ...inference.bounds.elbo import SequenceELBO, iwae_bound
 from ...inference.evaluation.estimates import clustered_variance, linearised
 from ...inference.evaluation.evaluation import ARROWS, Score
-from ...inference.evaluation.evaluation_windows import clip_index, on_device_of, seeded_evaluation
+from ...inference.evaluation.evaluation_windows import cluster_index, on_device_of, seeded_evaluation
 from ...inference.evaluation.record import MODELS, Dims
 from ...inference.evaluation.result import Result, Table, new_figure, progress_bar, styled
-from ...inference.evaluation.scores import TEACHER_FORCED, Metric, clip_means
+from ...inference.evaluation.scores import TEACHER_FORCED, Metric, cluster_means
 from ...options import nearest
 from ..bodies import vertex_error
 from .embodied import SHAPE, Segments, SegmentSchema, surfaces_of
@@ -134,8 +134,10 @@ class Reconstruction(Result):
         return self.rows[row]
 
     def _score(self, values: np.ndarray) -> Score:
-        takes = clip_index([(split, take, 0) for split, _, take in self.segments])
-        mean, deviations = linearised(np.array(clip_means(torch.from_numpy(values), takes)), takes.bincount().numpy())
+        takes = cluster_index([(split, take, 0) for split, _, take in self.segments])
+        mean, deviations = linearised(
+            np.array(cluster_means(torch.from_numpy(values), takes)), takes.bincount().numpy()
+        )
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
 
@@ -272,10 +274,10 @@ def _scores(model: Any, segments: Segments, particles: int, batch: Mapping[str, 
     data = on_device_of(model, batch)
     scores = _errors(segments, model.decode(model.encode(data), data[SHAPE]).cpu(), batch)
     terms = SequenceELBO().terms(model, data)
-    scores["ELBO"] = terms.per_frame
+    scores["ELBO"] = terms.per_step
     if particles:
         bound = iwae_bound(model, data, particles=particles)
-        scores |= {"IWAE bound": bound.bound / terms.frames, "k-hat": bound.khat}
+        scores |= {"IWAE bound": bound.bound / terms.n_steps, "k-hat": bound.khat}
     return scores
 
 

@@ -283,7 +283,7 @@ def prediction_bands(runs: Runs) -> Section:
         for name in [name for name, metric in evaluation.metrics.items() if metric.program == "teacher-forced"]:
             del evaluation.metrics[name]  # other sections show them
             for row in evaluation.rows.values():
-                row.clip_means.pop(name, None)
+                row.cluster_means.pop(name, None)
         return content + tabulated(evaluation.table())
 
     explanation = (

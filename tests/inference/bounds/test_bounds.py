@@ -99,8 +99,8 @@ def test_steps_sum_to_terms_and_terms_to_the_bound():
     torch.testing.assert_close(terms.steps["x"].sum(1), terms.log_likelihood["x"])
     torch.testing.assert_close(terms.steps["z"].sum(1), terms.kl["z"])
     torch.testing.assert_close(terms.bound, terms.log_likelihood["x"] - terms.kl["z"] - terms.kl["w"])
-    assert terms.frames.tolist() == lengths.tolist()
-    torch.testing.assert_close(terms.per_frame, terms.bound / terms.frames)
+    assert terms.n_steps.tolist() == lengths.tolist()
+    torch.testing.assert_close(terms.per_step, terms.bound / terms.n_steps)
     assert all((kl >= 0).all() for kl in terms.kl.values())
     pad = torch.arange(T) >= lengths[:, None]
     assert all((steps[pad] == 0).all() for steps in terms.steps.values())

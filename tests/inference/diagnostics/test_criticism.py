@@ -217,16 +217,16 @@ def test_x_moves_linearly_with_the_coordinates_that_it_reads_only():
         weights[..., 1] = 0
     x = model.sample(2, T)["x"]
     result = traverse(model, x, "w", span=(-2, 2), steps=5)
-    assert result.frames.shape == (3, 5, 2, T, 2)
+    assert result.decoded.shape == (3, 5, 2, T, 2)
     # The rounding of a matrix product may depend on the row and on the number of rows.
-    torch.testing.assert_close(result.frames[1], result.frames[1, :1].expand(5, -1, -1, -1), rtol=0, atol=1e-12)
+    torch.testing.assert_close(result.decoded[1], result.decoded[1, :1].expand(5, -1, -1, -1), rtol=0, atol=1e-12)
     assert result.effect[1] == pytest.approx(0, abs=1e-12)
-    step = result.frames.diff(dim=1)
+    step = result.decoded.diff(dim=1)
     slope = result.scale[:, None, None] * weights.detach()[:, 0].permute(2, 0, 1)  # (coordinate, T, D)
     torch.testing.assert_close(step, slope[:, None, None].expand_as(step))
     assert result.scale == pytest.approx(1, abs=0.2)  # the prior is N(0, I)
     selected = traverse(model, x, "w", coordinates=[2], span=(-2, 2), steps=5)
-    torch.testing.assert_close(selected.frames[0], result.frames[2], rtol=0, atol=1e-12)
+    torch.testing.assert_close(selected.decoded[0], result.decoded[2], rtol=0, atol=1e-12)
     in_deviations = traverse(model, model.sample(3, T)["x"], "w", unit="posterior", draws=4000).scale
     scale = model.encoder["w"].head.log_scale.exp().detach().flatten()
     torch.testing.assert_close(in_deviations, scale, rtol=0.05, atol=0)
@@ -245,7 +245,7 @@ def test_methods_can_be_criticised(name):
     checks = predictive_checks(model, ArrayWindows(x, 2), samples=19, progress=False)
     assert len(checks.checks) == 2 * len(STATISTICS)
     for latent in model.latents:
-        assert traverse(model, x, latent, [0], steps=3, draws=2).frames.shape == (1, 3, 3, 6, 9)
+        assert traverse(model, x, latent, [0], steps=3, draws=2).decoded.shape == (1, 3, 3, 6, 9)
 
 
 def test_checks_and_traversals_of_motion_are_printed_drawn_and_stored(people):

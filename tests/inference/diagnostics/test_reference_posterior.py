@@ -95,7 +95,7 @@ def test_the_exact_posterior_as_a_guide_has_no_bias_and_the_right_scale(mean_fie
     assert (abs(result.bias) < 4 * result.bias_error).all()
     assert (abs(result.ratio - 1) < 4 * result.ratio_error).all()
     off = ~np.eye(4, dtype=bool)
-    assert (abs(result.lack) < 4 * result.lack_error)[:, off].all()
+    assert (abs(result.correlation_difference) < 4 * result.correlation_difference_error)[:, off].all()
 
 
 def test_padding_changes_no_posterior():
@@ -110,7 +110,7 @@ def test_padding_changes_no_posterior():
         padded, again = (posterior(model, {"x": data, "lengths": lengths}, [0], **few) for data in (x, other))
         assert np.isnan(padded.bias[0]).tolist() == [False, False, False, True]  # w, z_1, z_2, z_3
         np.testing.assert_array_equal(padded.reference.mean, again.reference.mean)
-        np.testing.assert_array_equal(padded.lack, again.lack)
+        np.testing.assert_array_equal(padded.correlation_difference, again.correlation_difference)
         assert str(ReferencePosterior.from_json(padded.to_json())) == str(padded)
     np.testing.assert_allclose(
         exact.reference.mean[0, :3], dvae.Oracle(model, 2).posterior(x[:1, :2])[0][0], atol=1e-12

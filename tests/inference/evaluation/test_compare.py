@@ -116,7 +116,7 @@ def record(values, clips=None, frames=None):
     keys = [("test", str(clip), 0) for clip in clips]
     frames = np.ones(count) if frames is None else np.array(frames, dtype=float)
     counts = {"particles": 1, "contrasts": 0, "samples": 0, "seed": 0}
-    return Comparison(rows=rows, keys=keys, frames=frames, data={}, protocol={}, emission="mean", **counts)
+    return Comparison(rows=rows, keys=keys, n_steps=frames, data={}, protocol={}, emission="mean", **counts)
 
 
 def test_errors_over_sequences_are_clustered_by_clip_and_weighted_by_frames():
@@ -180,7 +180,7 @@ def test_ragged_sequences_are_weighted_by_their_frames():
     x = torch.randn(6, 7, 3, dtype=torch.float64)
     result = run({"a": model}, {"x": x, "lengths": lengths}, contrasts=6)
     row = result.rows["a"]
-    assert result.frames.tolist() == lengths.tolist()
+    assert result.n_steps.tolist() == lengths.tolist()
     assert result["a"]["ELBO"].mean == pytest.approx(row.bounds["ELBO"].sum() / lengths.sum().item())
     alive = np.array([(lengths > t).sum() for t in range(7)])
     assert (row.kl_steps["z"][0] * alive).sum() == pytest.approx(row.bounds["KL z"].sum())
@@ -257,7 +257,7 @@ def test_arviz_reads_the_comparison(fitted):
     for name, tree in trees.items():
         loo = arviz_stats.loo(tree, pointwise=True)
         assert loo.n_data_points == 24
-        bound = result[name]["IWAE bound"].mean * result.frames.sum()
+        bound = result[name]["IWAE bound"].mean * result.n_steps.sum()
         # p is Monte Carlo error only; it is 0 for an exact guide, up to rounding
         rounding = 24 * 100 * np.finfo(float).eps * abs(bound)
         assert loo.elpd == pytest.approx(bound, abs=3 * loo.p + rounding)

@@ -134,7 +134,7 @@ def test_histograms_are_stored_and_drawn(scored):
     assert titles == ["climatology, K = 50", "nearest neighbours, K = 50", "exact, K = 50"]
     assert "PIT mean (share)" in str(scored)
     assert "0–5" not in str(scored)
-    single = replace(scored, clips={"one": 300}, rows={"a": Row(50, {}, histograms={"PIT": np.full((1, 20), 0.05)})})
+    single = replace(scored, clusters={"one": 300}, rows={"a": Row(50, {}, histograms={"PIT": np.full((1, 20), 0.05)})})
     assert np.isnan(single.departure("a")[2]).all()
     single.plot_calibration()
 
@@ -171,10 +171,10 @@ def histogram(ranks, clips):
     """Return an evaluation with these PIT values (N, numbers)."""
     places = list(dict.fromkeys(clips))
     shares = (np.minimum(20 * ranks, 19).astype(int)[..., None] == np.arange(20)).mean(1)
-    clip_index = np.array([places.index(clip) for clip in clips])
-    means = tuple(tuple(shares[clip_index == place].mean(0)) for place in range(len(places)))
-    data = {"windows": len(ranks), "frames": 1 + ranks.shape[1], "coordinates": 1, "fingerprint": "f" * 64}
-    counts = {str(place): int((clip_index == place).sum()) for place in range(len(places))}
+    cluster_index = np.array([places.index(clip) for clip in clips])
+    means = tuple(tuple(shares[cluster_index == place].mean(0)) for place in range(len(places)))
+    data = {"windows": len(ranks), "steps": 1 + ranks.shape[1], "coordinates": 1, "fingerprint": "f" * 64}
+    counts = {str(place): int((cluster_index == place).sum()) for place in range(len(places))}
     rows = {"a": Row(50, {}, histograms={"PIT": np.array(means)})}
     return Evaluation(rows, {}, counts, data, {"observed": 1}, 50, "drawn", 0, 0)
 

@@ -17,7 +17,7 @@ from dvae.inference.bounds.elbo import SequenceELBO
 from dvae.inference.evaluation.evaluate import evaluate
 from dvae.inference.evaluation.evaluation import Evaluation, Score
 from dvae.inference.evaluation.references import last_value
-from dvae.inference.evaluation.scores import Measure, clip_means, means_of_those_that_count
+from dvae.inference.evaluation.scores import Measure, cluster_means, means_of_those_that_count
 from dvae.motion.scoring import metrics as errors
 from dvae.motion.scoring.metrics import multimodal_truths
 from dvae.program.model import DynamicalVAE
@@ -66,7 +66,7 @@ def free_running(forecaster, windows, **options):
     """Return the scores of a forecaster without a bound."""
 
     def no_bound(self, model, batch):
-        return SimpleNamespace(per_frame=torch.zeros(len(batch["x"])), kl={}, frames=FRAMES)
+        return SimpleNamespace(per_step=torch.zeros(len(batch["x"])), kl={}, n_steps=FRAMES)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SequenceELBO, "terms", no_bound)
@@ -76,7 +76,7 @@ def free_running(forecaster, windows, **options):
 # One evaluation
 
 
-def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_frame(model):
+def test_scores_are_the_metrics_of_the_forecasts_and_the_bound_per_step(model):
     windows = array_windows()
     result = run({"dkf": model}, windows, batch_size=12, training_windows=array_windows(20), seed=3)
     assert list(result.rows) == ["last value", "mean", "climatology", "nearest neighbours", "dkf"]
@@ -182,8 +182,8 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
     result = run({"dkf": model}, windows, configs={"dkf": {"width": 8}}, bound_particles=3, seed=5)
     result.save(tmp_path / "evaluation.json")
     again = Evaluation.load(tmp_path / "evaluation.json")
-    sizes = {"windows": 12, "frames": FRAMES, "coordinates": SIZE}
-    assert again.data == {"fingerprint": windows.fingerprint, "called": ["group", "step"], **sizes}
+    sizes = {"windows": 12, "steps": FRAMES, "coordinates": SIZE}
+    assert again.data == {"fingerprint": windows.fingerprint, "axis_names": ["group", "step"], **sizes}
     assert again.to_json() == result.to_json()
     assert (again.samples, again.seed, again.bound_particles) == (5, 5, 3)
     assert again.protocol == {"observed": OBSERVED}
@@ -196,7 +196,7 @@ def test_the_record_is_complete_and_is_read_back_from_json(model, tmp_path):
     scores = json.loads(result.to_json())["summary"]["dkf"]
     assert scores["ELBO"]["mean"] == result["dkf"]["ELBO"].mean
     assert scores["k-hat"]["mean"] is None  # three particles have no tail
-    np.testing.assert_array_equal(again.dataset["ADE"].sel(model="dkf"), again.rows["dkf"].clip_means["ADE"])
+    np.testing.assert_array_equal(again.dataset["ADE"].sel(model="dkf"), again.rows["dkf"].cluster_means["ADE"])
     document = result.document()
     for damage in ({"clips": {}}, {"metrics": {}}):
         with pytest.raises(ValueError, match="not written by Evaluation"):
@@ -282,7 +282,7 @@ def test_a_score_gets_forecasts_truth_past_and_indices():
     result, scores = still(windows, Measure("place", function, "windows", ""), batch_size=4)
     assert torch.equal(torch.cat(calls), torch.arange(9))
     assert scores["place"].mean == pytest.approx(4)
-    assert result.rows["last value"].clip_means["place"].tolist() == [1, 4, 7]
+    assert result.rows["last value"].cluster_means["place"].tolist() == [1, 4, 7]
     assert result.metrics["place"].unit == "windows"
     assert "place (windows)" in str(result)
 
@@ -309,4 +309,4 @@ def test_windows_with_nan_scores_leave_the_mean_but_not_their_clip():
     assert float(of_clips @ (clips.bincount() / 6.0)) == pytest.approx(4.0)  # (1 + 3 + 8) / 3
     assert of_clips[2] == pytest.approx(4.0)  # NaN values change nothing
     score_values = torch.arange(6.0)
-    assert means_of_those_that_count(score_values, clips) == pytest.approx(list(clip_means(score_values, clips)))
+    assert means_of_those_that_count(score_values, clips) == pytest.approx(list(cluster_means(score_values, clips)))

@@ -57,7 +57,7 @@ def ruin(state):
 def terms(frames=(4.0, 2.0), **tables):
     tables = {"log_likelihood": {"x": [-8.0, -4.0]}, "kl": {"w": [0.3, 0.9], "z": [2.0, 4.0]}, "energies": {}} | tables
     tables = {table: {k: torch.tensor(v).double() for k, v in values.items()} for table, values in tables.items()}
-    return Terms(**tables, frames=torch.tensor(frames).double())
+    return Terms(**tables, n_steps=torch.tensor(frames).double())
 
 
 def test_kl_weights_free_bits_and_energies_enter_the_loss_as_documented():
@@ -112,7 +112,7 @@ def test_a_fit_raises_the_bound_and_reports_terms_that_add_up():
             assert row["loss"] == pytest.approx(weight * row["kl/z"] - row["log_likelihood/x"])
 
 
-def test_validation_scores_are_unweighted_bounds_per_frame_of_held_out_data():
+def test_validation_scores_are_unweighted_bounds_per_step_of_held_out_data():
     model = build()
     lengths = torch.tensor([4, 1, 2, 3, 4, 4, 1])
     held_out = {"x": HELD_OUT, "lengths": lengths}

@@ -138,7 +138,7 @@ def test_the_loss_adds_errors_of_quaternions_and_positions_and_the_annealed_kl(w
     )
     errors = size / (2 * 0.01**2) * (rotations + 0.5 * positions)
     constant = size * (np.log(0.01) + 0.5 * np.log(2 * np.pi))
-    kl = (terms.kl["z"].sum() / terms.frames.sum()).detach()
+    kl = (terms.kl["z"].sum() / terms.n_steps.sum()).detach()
     for step, weight in ((0, 0.0), (10, 0.5), (39, 1.0)):
         expected = errors + constant + weight * kl
         torch.testing.assert_close(objective(terms, step), expected, rtol=1e-5, atol=0.02 * float(kl))

@@ -108,7 +108,7 @@ def test_the_model_of_human36m_has_the_published_size(modes, published):
 
 def test_the_loss_of_dlow_equals_the_one_of_the_paper(windows):
     """The CVAE decodes each future from a_k e + b_k. The model rotates windows, which keeps distances."""
-    options = {"held": ("lower", "Head"), "hold": 0.5, "join": 3.0, "beta": 0.7, "diversity_scale": 2.0}
+    options = {"fixed": ("lower", "Head"), "fixed_weight": 0.5, "join": 3.0, "beta": 0.7, "diversity_scale": 2.0}
     model, batch = built(windows, "dlow", **options), batch_of(windows)
     objective = small("dlow", **options).train(windows).objective
     torch.manual_seed(1)
@@ -133,7 +133,7 @@ def test_the_loss_of_dlow_equals_the_one_of_the_paper(windows):
     )
     steps = (futures[:, :, 0] - batch["x"][:, PAST - 1]).square().sum(2).mean(0)
     expected = 2 * best + 0.7 * divergence + 50 * similarity + 0.5 * fixed + 3 * steps
-    assert terms.frames.tolist() == [FUTURE] * 4
+    assert terms.n_steps.tolist() == [FUTURE] * 4
     assert objective(terms, 0).item() == pytest.approx((expected.sum() / (4 * FUTURE)).item(), rel=1e-9)
     assert not terms.kl["e"].any()
 

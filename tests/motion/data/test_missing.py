@@ -19,7 +19,7 @@ from dvae.cli.console import Missing
 from dvae.cli.help import Expert
 from dvae.inference.diagnostics.checks import STATISTICS
 from dvae.inference.evaluation import metrics
-from dvae.inference.evaluation.evaluation_windows import clip_index
+from dvae.inference.evaluation.evaluation_windows import cluster_index
 from dvae.inference.evaluation.references import distances, last_value
 from dvae.models.motion.trajectories import TrajectoryMethod
 from dvae.models.registry import METHODS
@@ -97,11 +97,11 @@ def test_gaps_are_read_from_a_folder_and_an_archive(tmp_path, format):
 
 
 def test_resampling_and_dividing_keep_missing_values():
-    parts, half = GAPS.divided(0.3), GAPS.resampled(WALKER.fps / 2)
+    parts, half = GAPS.assign_splits(0.3), GAPS.resample(WALKER.fps / 2)
     assert parts.missing
     assert half.missing
     assert sum(np.isnan(clip.positions).sum() for clip in parts) == sum(np.isnan(clip.positions).sum() for clip in GAPS)
-    doubled = GAPS.resampled(2 * WALKER.fps)  # its even frames are the original ones
+    doubled = GAPS.resample(2 * WALKER.fps)  # its even frames are the original ones
     for clip, slow, fast in zip(GAPS, half, doubled, strict=True):
         np.testing.assert_array_equal(slow.positions, clip.positions[::2])
         np.testing.assert_array_equal(fast.positions[::2], clip.positions)
@@ -263,7 +263,7 @@ def test_diversity_uses_numbers_observed_in_both_futures():
 def test_forecasts_at_missing_values_change_no_score_and_the_truth_has_error_zero():
     complete, windows = (motion.windows(each, motion.PROTOCOLS["simulated"], "test") for each in (PEOPLE, GAPS))
     observed, x, index = windows.protocol.observed, windows.all().mask_to_nan(), torch.arange(len(windows))
-    past, truth, clips = windows.all().past(observed), x[:, observed:], clip_index(windows.keys)
+    past, truth, clips = windows.all().past(observed), x[:, observed:], cluster_index(windows.keys)
     forecasts, real = torch.randn(len(x), 3, *truth.shape[1:]), complete.all()["x"][:, None, observed:]
     anywhere = torch.where(truth[:, None].isnan(), 9.0, forecasts)
     measures = {measure.name: measure for measure in motion.scores(windows)}

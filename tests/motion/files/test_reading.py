@@ -136,7 +136,7 @@ def test_samples_are_people_of_a_plausible_size(file, joints, note, shared, real
     assert len(motion_set.skeleton.left) == len(motion_set.skeleton.right) > 0
     assert read_motion(shared(f"cmu_raw/{file}"), onto=WALKER).skeleton.names == WALKER.names
     if not file.endswith("bvh"):
-        onto = read_motion(shared(f"cmu_raw/{file}"), onto=real("cmu/cmu8.npz").skeleton).resampled(30)
+        onto = read_motion(shared(f"cmu_raw/{file}"), onto=real("cmu/cmu8.npz").skeleton).resample(30)
         expected = real("cmu/cmu8.npz")["test", "running_1"].positions
         np.testing.assert_allclose(onto.clips[0].positions, expected, atol=1e-4)
 
@@ -287,11 +287,11 @@ def test_joints_are_selected_by_index_or_name_and_renamed(kind, people, tmp_path
 def test_motion_is_resampled_by_selection_or_interpolation(people):
     turning = people.with_rotations()
     clip = turning.clips[0]
-    half = turning.resampled(15)
+    half = turning.resample(15)
     np.testing.assert_array_equal(half.clips[0].positions, clip.positions[::2])
     np.testing.assert_array_equal(half.clips[0].rotations, clip.rotations[::2])
     assert half.skeleton.fps == 15
-    double, between = turning.resampled(60), (clip.positions[1:] + clip.positions[:-1]) / 2
+    double, between = turning.resample(60), (clip.positions[1:] + clip.positions[:-1]) / 2
     np.testing.assert_allclose(double.clips[0].positions[::2], clip.positions, atol=1e-6)
     np.testing.assert_allclose(double.clips[0].positions[1::2], between, atol=1e-6)
     middle = clip.rotations[1:] + clip.rotations[:-1]  # half way on an arc
@@ -299,12 +299,12 @@ def test_motion_is_resampled_by_selection_or_interpolation(people):
     np.testing.assert_allclose(double.clips[0].rotations[1::2], middle, atol=1e-6)
     for wrong in (0, float("nan")):
         with pytest.raises(ValueError, match="frames per second"):
-            people.resampled(wrong)
+            people.resample(wrong)
 
 
 def test_recordings_without_splits_are_divided(people):
     single = MotionSet([Clip("all", "walk", people.clips[0].positions)], WALKER)
-    parts = single.divided(0.25, 10)
+    parts = single.assign_splits(0.25, 10)
     assert [(clip.key, clip.frames) for clip in parts] == [
         (("train", "walk"), 20),
         (("train", "walk-1"), 10),
@@ -313,10 +313,13 @@ def test_recordings_without_splits_are_divided(people):
     np.testing.assert_array_equal(np.concatenate([clip.positions for clip in parts]), single.clips[0].positions)
     both = MotionSet([Clip("a/b", "x", people.clips[0].positions), Clip("c", "x", people.clips[1].positions)], WALKER)
 
-    assert [clip.key for clip in both.divided(0.5, 30)] == [("train", "a-b-x"), ("test", "c-x")]  # too short for parts
-    assert [clip.split for clip in single.divided(0.5, 30)] == ["train"]
+    assert [clip.key for clip in both.assign_splits(0.5, 30)] == [
+        ("train", "a-b-x"),
+        ("test", "c-x"),
+    ]  # too short for parts
+    assert [clip.split for clip in single.assign_splits(0.5, 30)] == ["train"]
     with pytest.raises(ValueError, match="`test` must be a fraction above 0 and below 1, got 1"):
-        single.divided(1)
+        single.assign_splits(1)
 
 
 def test_a_single_recording_has_windows_of_every_split(tmp_path):
@@ -325,7 +328,7 @@ def test_a_single_recording_has_windows_of_every_split(tmp_path):
     data = MotionData.open(tmp_path / "own.bvh")
     assert (data.protocol.observed, data.protocol.predicted, data.protocol.fps) == (15, 60, 30)
     assert all(len(data.windows(split)) for split in ("train", "validation", "test"))
-    again = MotionData.reopened(data.recorded(), data.schema)
+    again = MotionData.reopen(data.recorded(), data.schema)
     assert (again.protocol, again.fingerprint) == (data.protocol, data.fingerprint)
 
 
@@ -337,14 +340,14 @@ def test_other_data_are_mapped_to_the_skeleton_of_a_run(representation, tmp_path
     data = MotionData.open(tmp_path / "a.npz", protocol)
     names = [f"mixamorig:{name.replace('L', 'Left', 1)}" if name[0] == "L" else name for name in WALKER.names]
     write_motion(tmp_path / "b", MotionSet(others.clips, replace(WALKER, names=names)), "bvh")
-    reopened = MotionData.reopened(data.recorded(), data.schema, tmp_path / "b")
+    reopened = MotionData.reopen(data.recorded(), data.schema, tmp_path / "b")
     assert (reopened.schema, reopened.onto) == (data.schema, True)
     for clip in others:
         assert np.linalg.norm(reopened.motion[clip.key].positions - clip.positions, axis=-1).max() < 0.01
-    again = MotionData.reopened(data.recorded(), data.schema, tmp_path / "a.npz")
+    again = MotionData.reopen(data.recorded(), data.schema, tmp_path / "a.npz")
     assert (again.fingerprint, again.onto) == (data.fingerprint, False)
     write_motion(tmp_path / "c", MotionSet(others.clips, replace(WALKER, names=[*names[:-1], "Paw"])), "bvh")
-    strange = MotionData.reopened(data.recorded(), data.schema, tmp_path / "c")
+    strange = MotionData.reopen(data.recorded(), data.schema, tmp_path / "c")
     assert (strange.schema == data.schema, strange.onto) == (False, False)
 
 

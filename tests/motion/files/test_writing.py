@@ -66,7 +66,7 @@ def test_a_converted_folder_equals_the_folder_as_read(jobs, recordings, tmp_path
     options = ["--fps", "15", "--onto", "human36m", "--jobs", str(jobs)]
     assert main(["data", "convert", str(recordings), "--out", str(tmp_path / "a.npz"), *options]) == 0
     assert "3 clips; read as unit centimetres" in capsys.readouterr().err
-    converted, expected = read_motion(tmp_path / "a.npz"), read_motion(recordings, onto=HUMAN36M).resampled(15)
+    converted, expected = read_motion(tmp_path / "a.npz"), read_motion(recordings, onto=HUMAN36M).resample(15)
     assert [clip.key for clip in converted] == [clip.key for clip in expected]
     for clip in expected:
         np.testing.assert_array_equal(converted[clip.key].positions, clip.positions)

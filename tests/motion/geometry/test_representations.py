@@ -10,7 +10,7 @@ from dvae import motion
 from dvae.cli.futures import draw_futures
 from dvae.data.batch import Batch
 from dvae.data.schema import SchemaError
-from dvae.inference.evaluation.evaluation_windows import clip_index
+from dvae.inference.evaluation.evaluation_windows import cluster_index
 from dvae.motion.geometry import kinematics, rotations
 from dvae.motion.geometry.views import LENGTHS, ROTATIONS, Rotations
 from dvae.motion.scoring import metrics as errors
@@ -148,8 +148,8 @@ def test_a_run_on_rotations_stores_its_rest_pose_and_draws_the_scored_futures(pe
         torch.from_numpy(futures.truth[..., 1:, :]).flatten(2),
     )
     evaluation = dvae.evaluate(run.model, test, scores=motion.scores, samples=3, seed=0, progress=False).rows["model"]
-    means = [error[places == clip].mean() for places in [clip_index(test.keys)] for clip in places.unique()]
-    torch.testing.assert_close(torch.stack(means), torch.tensor(evaluation.clip_means["ADE"]).to(error))
+    means = [error[places == clip].mean() for places in [cluster_index(test.keys)] for clip in places.unique()]
+    torch.testing.assert_close(torch.stack(means), torch.tensor(evaluation.cluster_means["ADE"]).to(error))
 
 
 def test_data_without_rotations_are_errors(people_of_two_sizes):

@@ -98,7 +98,7 @@ def test_its_bound_is_the_log_likelihood_of_the_class_from_the_predicted_frames(
     log_softmax = model.logits(model.features(x[:, 4:])).log_softmax(-1)
     terms = dvae.SequenceELBO().terms(model, {"x": x, "c": c})
     torch.testing.assert_close(terms.log_likelihood["c"], log_softmax[torch.arange(len(c)), c])
-    torch.testing.assert_close(terms.per_frame, terms.log_likelihood["c"])  # each window counts once
+    torch.testing.assert_close(terms.per_step, terms.log_likelihood["c"])  # each window counts once
     elsewhere = torch.cat([draw(len(x), 4, x.shape[2]), x[:, 4:]], 1)
     assert torch.equal(dvae.SequenceELBO().terms(model, {"x": elsewhere, "c": c}).bound, terms.bound)
 

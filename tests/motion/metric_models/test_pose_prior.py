@@ -64,7 +64,7 @@ def test_every_frame_is_an_independent_pose(train):
     assert expected.shape == x.shape[:2]
     torch.testing.assert_close(terms.steps["d"], expected)
     torch.testing.assert_close(terms.bound, expected.sum(1))
-    assert terms.frames.tolist() == [10, 10, 10]
+    assert terms.n_steps.tolist() == [10, 10, 10]
     assert terms.kl == {}
     z, log_det = prior(prior.skeleton.directions(x))
     noise = torch.distributions.Normal(0.0, 1.0).log_prob(z).sum(-1)

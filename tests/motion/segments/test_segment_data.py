@@ -47,11 +47,11 @@ def test_reopened_data_have_the_same_segments(options, tmp_path):
     motion.save(tmp_path / "people.npz", PEOPLE)
     data = SegmentData.open(tmp_path / "people.npz", **options)
     source, schema = data.recorded(), SegmentSchema.from_config(json.loads(json.dumps(data.schema.config())))
-    again = SegmentData.reopened(SegmentSource(**vars(source)), schema)
+    again = SegmentData.reopen(SegmentSource(**vars(source)), schema)
     assert again.fingerprint == source.fingerprint
     assert (bool(schema.timed.mean), len(schema.timed.references)) == ((True, 2) if options else (False, 0))
     assert torch.equal(again.windows("test").all()["x"], data.windows("test").all()["x"])
-    other = SegmentData.reopened(source, schema, "simulated")  # with the time grid of the run
+    other = SegmentData.reopen(source, schema, "simulated")  # with the time grid of the run
     assert other.timed is schema.timed
     assert other.fingerprint != source.fingerprint
 

@@ -133,7 +133,7 @@ def test_independently_bending_bones_of_a_joint_get_their_own_joints(people):
         positions[:, duplicated] = rotate_about_up(ahead, angle, "z")[..., [2, 0, 1]].numpy() + pelvis
     clips = [replace(clip, positions=x, rotations=None) for clip, x in zip(people, bent, strict=True)]
     motion = MotionSet(clips, replace(skeleton, rest=()))
-    loose = motion.loosened()
+    loose = motion.with_extra_joints()
     assert loose.skeleton.names == (*skeleton.names, "Pelvis-Spine")
     assert loose.skeleton.parents[spine] == 17
     assert loose.skeleton.heading(torch.from_numpy(loose.clips[0].positions)).equal(
@@ -144,4 +144,4 @@ def test_independently_bending_bones_of_a_joint_get_their_own_joints(people):
     off = [largest(each, view.back(view.to(each))) for each, view in zip((bent, straight), views, strict=True)]
     assert off[1] < 2e-3 < 0.02 < off[0]
     with pytest.raises(ValueError, match="has rotations; joints can only be added to complete poses"):
-        people.loosened()
+        people.with_extra_joints()
