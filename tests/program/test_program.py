@@ -215,5 +215,5 @@ def test_arrays_are_converted_to_the_precision_of_the_model():
     x = np.random.default_rng(0).normal(size=(2, 4, 3))
     assert model.forecast(x, 2)["x"].dtype == torch.float64
     assert model.float().forecast({"x": x}, 2)["x"].dtype == torch.float32
-    frames = SequenceELBO().terms(model, {"x": x, "lengths": [4, 2]}).frames
+    frames = SequenceELBO().terms(model, {"x": x, "lengths": [4, 2]}).n_steps
     assert frames.tolist() == [4, 2]

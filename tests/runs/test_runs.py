@@ -389,7 +389,7 @@ def test_a_nonfinite_forecast_is_an_error_with_its_clip(run, capsys):
     recommit(run, BEST, save(huge))
     out = run / "futures.npz"
     assert "of clip 'person_" in failure(capsys, "forecast", run, "--out", out)
-    assert "of clip 'person_" in failure(capsys, "evaluate", run)
+    assert "of 'person_" in failure(capsys, "evaluate", run)
     assert not out.exists()
 
 

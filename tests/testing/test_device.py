@@ -197,7 +197,7 @@ def test_terms_have_the_precision_of_the_model_under_autocast(name, device, smal
     exact = value(terms())
     with torch.autocast(device, torch.bfloat16):
         mixed_terms = terms()
-    assert {part.dtype for part in (mixed_terms.bound, mixed_terms.frames, *numbers(mixed_terms).values())} == {
+    assert {part.dtype for part in (mixed_terms.bound, mixed_terms.n_steps, *numbers(mixed_terms).values())} == {
         torch.float32
     }
     weights, squares = [parameter.clone() for parameter in model.parameters()], []
