@@ -164,6 +164,8 @@ def info(paths: Sequence[str], out: Path | None, options: ColumnOptions) -> None
     """Print a summary of each table and a schema to edit; columns without a given role are guessed."""
     if out is not None and len(paths) > 1:
         raise UsageError(f"--out writes the schema of one table, got {len(paths)} tables; name one")
+    if out is not None and out.exists():
+        raise UsageError(f"{out} exists and may have been edited; edit it, remove it, or choose another file")
     for path in paths:
         data_set = PanelData.open(path, **options.given())
         panel = data_set.panel

@@ -18,6 +18,7 @@ import csv
 import math
 import os
 import re
+import textwrap
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ import numpy as np
 
 from .. import files
 from ..data.npy import mapped
+from ..distributions.family import FAMILIES
 from ..options import nearest
 from .column_inference import ColumnHints
 from .columns import MOST, Columns, layout, parsed
@@ -397,10 +399,20 @@ def read_schema(text: str) -> tuple[Columns | ColumnHints | None, Cut | None]:
 
 def written_schema(columns: Columns, cut: Cut) -> str:
     """Return a schema as an editable TOML file."""
+    comments = [
+        "# role: target (default; modelled), known (covariate, known in the future), past (covariate, known up to the",
+        "# present) or static (one value per sequence)",
+        *textwrap.wrap(
+            f"family of a target: {', '.join(FAMILIES)}; of other columns: real, category",
+            width=110,
+            initial_indent="# ",
+            subsequent_indent="# ",
+        ),
+    ]
     entries = {name: value for name, value in asdict(cut).items() if value != getattr(Cut, name)}
     lines = [
         "[cut]",
         f'split = "{entries.pop("split", cut.split)}"',
         *(f"{name} = {value}" for name, value in entries.items()),
     ]
-    return columns.to_toml() + "\n" + "\n".join(lines) + "\n"
+    return "\n".join([*comments, "", columns.to_toml()]) + "\n" + "\n".join(lines) + "\n"
