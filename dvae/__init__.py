@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from .lazy import importing
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if sys.flags.optimize > 1:  # Pyro edits its own docstrings at import
     raise ImportError("dvae needs Pyro, which needs docstrings: run python without -OO (PYTHONOPTIMIZE=2); -O is fine")
