@@ -91,7 +91,7 @@ def evaluate(
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
-        control: paths given to methods that take trajectories.
+        control: joints whose true paths are given to methods that take trajectories.
         data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
         samples: number K of forecasts of each window.
         bound_particles: number of particles of the IWAE bound; 0 omits it.
@@ -240,14 +240,14 @@ def compare(
         run: run directories, fitted on the same data under the same protocol.
         data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
         particles: number K of particles of the IWAE bound.
-        estimates: number of independent estimates of the IWAE bound; 25 or more for arviz, 1 otherwise.
+        estimates: number of independent estimates of the IWAE bound; `to_arviz` of the result needs at least 25.
         filter_particles: number of particles of the FIVO bound; 0 omits it.
         contrasts: number of windows for the mutual information of latents and data; 0 omits it.
         samples: number of forecasts of each window.
         forecasts: also score forecasts, which takes longest.
-        draw_emission: whether forecasts are draws of x or means of its emission distribution. By default draws for a
-            table and means for motion, whose published scores use means, unless the data are discrete or nothing is
-            latent.
+        draw_emission: whether forecasts are draws of x or means of its emission distribution. By default means
+            for motion, as in published scores, and draws for a table. Discrete data and models without latents are
+            always drawn by default.
         stride: frames between the starts of test windows, in place of the protocol's; a larger stride is faster.
         seed: seed of the draws.
         batch_size: number of windows scored at once.

@@ -203,7 +203,7 @@ def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:
 
 
 def _write_recovered(out: Path, recovered: Recovered, draws: int) -> None:
-    """Write the most probable segments and draws as a motion file, an html page, a BVH file, or a folder of these."""
+    """Write the most probable segments, and draws of them, as a motion file, an html page, a BVH file or a folder."""
     motions, suffix = recovered.motion(draws), out.suffix.lower()
     if suffix == ".npz":
         motion.write_motion(out, motions)

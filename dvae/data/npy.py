@@ -93,7 +93,7 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
 
     Args:
         path: the file.
-        links: whether to follow a symbolic link, for a path that the user typed.
+        links: whether to follow a symbolic link; set it only for paths that the user typed.
 
     Raises:
         ValueError: if the path is a link or not a file, or the file is truncated or not an npy file of real numbers in

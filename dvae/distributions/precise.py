@@ -70,7 +70,7 @@ class OffsetDistribution(_Wrapped):
         self.offset, self.dtype = offset, dtype
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density in nats, in the precision of the base distribution, of values in float64."""
+        """Return the log density of float64 values in nats; the result has the precision of the base distribution."""
         return self.base.log_prob((value - self.offset).to(self.dtype))  # type: ignore[no-any-return]
 
     @override

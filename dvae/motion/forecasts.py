@@ -67,7 +67,7 @@ class Forecasts:
                 split, clip, start = self.keys[int(invalid_windows.argmax())]
                 raise FloatingPointError(
                     f"the {name} of the window of clip {clip!r} ({split}) from frame {start} on are NaN or infinite; "
-                    "positions must be finite, and only missing joints of observed and true frames may be NaN"
+                    "positions must be finite, except NaN for missing joints of observed and true frames"
                 )
 
     def window(self, n: int, samples: int | None = None) -> Forecasts:

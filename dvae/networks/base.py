@@ -102,7 +102,7 @@ class Network(nn.Module):
         """Return the features (B, H) at step t (counted from 0) and the next state.
 
         Args:
-            state: state from `start` or the previous `step`. A loop calls `step` once for each step, in its order.
+            state: state from `start` or the previous `step`. A loop calls `step` once for each step.
             t: the step.
             samples: {name: list with the values (B, D) of each step} of the parents that the loop draws.
 

@@ -314,8 +314,8 @@ class Conditional(nn.Module):
         Args:
             state: result of `start` or of the previous step.
             t: index of the step, from 0.
-            samples: values (B, D) by step of the variables that the loop draws, by name.
-            count: number of steps that are evaluated at once; t is the last of them.
+            samples: {name: list with the values (B, D) of each step} of the variables that the loop draws.
+            count: number of steps that the network evaluates at once, of which t is the last.
         """
         if self.network is None:
             return tuple(p[t] for p in state), state

@@ -124,7 +124,9 @@ class Loaded:
         if differing := [name for name in stored | other_config if stored.get(name) != other_config.get(name)]:
             values = (f"{name} is {brief(other_config.get(name))}, not {brief(stored.get(name))}" for name in differing)
             more = f"; and {len(differing) - 3} more" if len(differing) > 3 else ""
-            raise ValueError(f"{os.fspath(path)} does not fit {self.path}: {'; '.join(islice(values, 3))}{more}")
+            raise ValueError(
+                f"the data in {os.fspath(path)} do not match the run {self.path}: {'; '.join(islice(values, 3))}{more}"
+            )
         return other
 
 

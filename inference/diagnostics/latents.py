@@ -130,7 +130,7 @@ class Inferred:
         return joined({name: draws[name] for name in self.model.latents})[:, self.valid]
 
     def whitened(self, z: Tensor) -> Tensor:
-        """Return the numbers u (..., P) of z."""
+        """Return u = (z - mean) / scale, (..., P), by mean and standard deviation of the guide's draws."""
         return (z - self.center) / self.scale
 
     def log_joint(self, u: Tensor) -> Tensor:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
 """Arrow for each direction that is better."""
+COLUMNS = 5
+"""Largest number of methods in columns of a table; more are in rows if there are not more metrics."""
 _MOST_RANKS = 10_000  # the envelope of so many ranks takes a second
 
 
@@ -162,7 +164,9 @@ class Evaluation(Result):
 
     @override
     def table(self, metrics: Sequence[str] | None = None) -> Table:
-        """Return a table of mean ± standard error, a row per metric and a column per method, by kind of score.
+        """Return a table of mean ± standard error: metrics in rows, methods in columns, by kind of score.
+
+        If there are more than five methods and not more metrics, methods are in rows.
 
         Args:
             metrics: names of the metrics to include, in any order; default: all.
@@ -175,13 +179,29 @@ class Evaluation(Result):
                 raise KeyError(f"no method has a score {name!r}{nearest(name, self.metrics)}")
         table = Table(title=self._title(), caption=self._caption())
         table.add_column("", no_wrap=True)  # on a narrow terminal numbers wrap, and names do not
-        for method, row in self.rows.items():
-            table.add_column(f"{method}\nK = {row.samples}", justify="right")
         scores = {method: self[method] for method in self.rows}
-        for program in ("free-running", "teacher-forced"):
-            of_program = {name: metric for name, metric in self.metrics.items() if metric.program == program}
-            if metrics is not None:
-                of_program = {name: metric for name, metric in of_program.items() if name in metrics}
+        selected = {name: metric for name, metric in self.metrics.items() if metrics is None or name in metrics}
+        by_program = {
+            program: {name: metric for name, metric in selected.items() if metric.program == program}
+            for program in ("free-running", "teacher-forced")
+        }
+        if len(self.rows) > max(COLUMNS, len(selected)):
+            ordered = [*by_program["free-running"], *by_program["teacher-forced"]]
+            for name in ordered:
+                metric = selected[name]
+                lines = (
+                    name + ARROWS[metric.better],
+                    metric.unit,
+                    "" if metric.program == "free-running" else metric.program,
+                )
+                table.add_column("\n".join(filter(None, lines)), justify="right")
+            for method, row in scores.items():
+                values = (str(row[name]) if name in row else "–" for name in ordered)
+                table.add_row(f"{method}, K = {self.rows[method].samples}", *values)
+            return table
+        for method, evaluated in self.rows.items():
+            table.add_column(f"{method}\nK = {evaluated.samples}", justify="right")
+        for program, of_program in by_program.items():
             if of_program:
                 table.add_section()
                 table.add_row(Text(program, "bold"))

@@ -86,9 +86,8 @@ def _discrete(model: DynamicalVAE) -> tuple[list[list[int]], Tensor]:
 def _spreads(x: Tensor, mask: Tensor, classes: Sequence[list[int]], discrete: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean (D,) of training windows, and the standard deviations (T, D) of their differences.
 
-    Row 0 is the standard deviation from the mean, and row h of differences over h steps. For a class variable, the
-    first coordinate instead contains the probability of each class in row 0, and the probability of no change in later
-    rows.
+    Row 0 has the standard deviations from the mean, and row h those of differences over h steps. For a class variable,
+    only the first coordinate is used: row 0 has 1 / number of classes, later rows the probability of no change.
 
     Args:
         x: training windows (N, T, D).

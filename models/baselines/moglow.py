@@ -115,8 +115,8 @@ class MoGlow(LikelihoodMethod):
         parts = distribution.parts if isinstance(distribution, Product) else [((), distribution)]
         if all(part != FAMILIES["real"] for _, part in parts):
             raise ValueError(
-                'moglow is a flow of columns of the family "real", but no target has this family; fit '
-                "autoregressive, which has the same factor, or give columns another family"
+                'moglow is a flow of columns of the family "real", but no target has it; give a target '
+                "this family, or fit autoregressive, which takes every family"
             )
         flow = self.distributions()["p(x)"]
         if not isinstance(distribution, Product):

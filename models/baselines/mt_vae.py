@@ -268,7 +268,7 @@ class Embedding(nn.Module):
         self.network, self.out = NormedLSTM(size, width), nn.Linear(width, width)
 
     def forward(self, poses: Tensor, lengths: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return content and style of poses (B, T, D), or (B, T D) frame by frame, up to `lengths` if given."""
+        """Return content and style of poses (B, T, D), or flattened (B, T * D), up to `lengths` if given."""
 
         def compute() -> tuple[Tensor, Tensor]:
             shares = self.network.share(poses.reshape(len(poses), -1, self.size)).unbind(1)

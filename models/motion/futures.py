@@ -51,8 +51,8 @@ class FutureMethod(PoseMethod):
 
     Args:
         latent: size of the latent.
-        beta: weight of the KL, relative to squared errors in square metres. By default the papers' values for Human3.6M
-            and HumanEva, and the value for Human3.6M for other poses.
+        beta: weight of the KL, relative to squared errors in square metres. By default the papers' value for
+            Human3.6M or HumanEva; other poses use that for Human3.6M.
         join: weight of the squared distance between the last observed pose and the first predicted one.
         heading: whether to rotate every window so that its last observed pose faces one way, and rotate the futures
             back. By default off for Human3.6M and HumanEva, and on for other skeletons with known left and right.

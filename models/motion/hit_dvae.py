@@ -282,7 +282,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
 
     @override
     def start(self, model: Any, windows: Any) -> None:
-        """Prepare a model: fit the units of the poses, and initialise a learned scale of x at these units."""
+        """Compute mean and scale of the poses for standardisation, and start a learned scale of x at that scale."""
         start_priors(model, windows)
         if isinstance(model, EnergyModel):
             super().start(model, windows)

@@ -283,7 +283,7 @@ class ModesModel(FutureModel):
 
     @override
     def reconstruct(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:
-        """Return the means of the data, in sets as in `forecast`."""
+        """Return the means of x given latents of the guide, K samples for each mode, as in `forecast`."""
         base_reconstruct = super().reconstruct
 
         def make(part: slice, modes: Tensor, count: int) -> dict[str, Tensor]:

@@ -73,7 +73,7 @@ class TrajectoryMethod(PoseMethod):
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
     def extra_inputs(self) -> Paths:
-        """Return the view that adds inputs to the motion."""
+        """Return the view (see `dvae.data.views`) that adds joint trajectories and the first pose to each window."""
         return Paths()
 
     def kind(self) -> type[TrajectoryModel]:
@@ -312,8 +312,8 @@ class TrajectoryModel(DynamicalVAE):
         trajectories = data.get(GIVEN, first.new_zeros(len(first), horizon, first.shape[-1]))
         if trajectories.dim() != 3 or (len(trajectories), trajectories.shape[-1]) != first.shape:
             raise ValueError(
-                f"poses have shape {tuple(first.shape)}; expected trajectories (B, frames, D), got "
-                f"{tuple(trajectories.shape)}"
+                f"trajectories have shape {tuple(trajectories.shape)}; expected (B, frames, D) with B and D of "
+                f"the first poses, {tuple(first.shape)}"
             )
         if trajectories.shape[1] < horizon:
             raise ValueError(f"the trajectories have {trajectories.shape[1]} frames, but the horizon is {horizon}")

@@ -2,18 +2,19 @@
 
     p(z_k | y_{1:T}, s) p(x_t | z_{1:T}, s)        q(z_k | r_{1:T}, s)
 
-k counts coefficients of the cosine transform, and t counts frames. z has as many coefficients as x has frames, so both
-are written as steps. The prior is learned: a transformer of the given trajectories y and the first pose s. The guide
-reads the remaining joints, r. The mean of x is s plus the cumulative sum of offsets over time. The loss is
+k counts coefficients of the cosine transform, and t counts frames. Both are written as steps, because x has a
+coefficient for each frame; high ones can be left out (`coefficients`). The prior is learned: a transformer of the
+given trajectories y and the first pose s. The guide reads the remaining joints, r. The mean of x is s plus the
+cumulative sum of offsets over time. The loss is
 
     sum_t |x_t - mean_t|^2 + .01 KL(q | p)
 
 Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation. Prior and guide
 share the perceptrons of poses and two of three transformers; the decoder shares the perceptron of s. Two choices are
-ours. Scales of z use softplus, whereas the public implementation has log-variances. Without the learned prior, on which
-the paper gives little detail, the decoder reads z and the trajectories, the latter in time without a transform. On
-other data than the paper's, the defaults are small networks, few coefficients, a smaller weight of the KL, and windows
-rotated to one heading (docs/results/trajevae.md).
+ours. Scales of z use softplus, whereas the public implementation has log-variances. If the learned prior is switched
+off, on which the paper gives little detail, the decoder reads z and the trajectories frame by frame. On other data
+than the paper's, the defaults are small networks, few coefficients, a smaller weight of the KL, and windows rotated to
+one heading (docs/results/trajevae.md).
 """
 
 from __future__ import annotations

@@ -504,7 +504,7 @@ def test_data_with_other_joints_are_errors_unless_they_match(capsys, run, tmp_pa
     skeleton = replace(clips.skeleton, name="stranger", fps=60.0)
     motion.save(tmp_path / "far" / "people.npz", motion.MotionSet(list(clips), skeleton, "people"))
     error = failure(capsys, "evaluate", str(run), "--data", str(tmp_path / "far" / "people.npz"))
-    assert f"people.npz does not fit {run}: " in error
+    assert f"people.npz do not match the run {run}: " in error
     assert "skeleton.name is 'stranger', not 'walker'" in error
     assert "skeleton.fps is 60.0, not 30.0" in error
     other = motion.simulate(clips=8, frames=90, seed=5)

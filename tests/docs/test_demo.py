@@ -19,9 +19,9 @@ def test_the_demo_resumes_after_an_interruption(tmp_path, monkeypatch):
             demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
     monkeypatch.setattr(demo, "resume", lambda run: resumed.append(resume(run)) or resumed[-1])
     demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
-    assert [(fit.status, fit.step, fit.run.name) for fit in resumed] == [("finished", 2, "hit-dvae")]
+    assert [(fit.status, fit.step, fit.run.name) for fit in resumed] == [("finished", 2, "bom-parts")]
     rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
-    assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
+    assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.METHODS}
     data = {"people.npz", "people.npz.labels.csv", "people.npz.skeleton.json"}
     names = {"evaluation.json", "futures.png", "report.html", "runs", *data}
     assert {file.name for file in (tmp_path / "demo").iterdir()} == names

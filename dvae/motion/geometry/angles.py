@@ -109,7 +109,7 @@ def _humaneva() -> Iterator[Angle]:
 
 
 def _trunk_and_limbs(head: Vector) -> Iterator[Angle]:
-    """Yield the angles for skeletons with ankles and toes, and with Spine, Chest and Neck between pelvis and head.
+    """Yield the angles of a skeleton that has ankles, toes, Spine, Chest and Neck.
 
     Args:
         head: vector along the head.
