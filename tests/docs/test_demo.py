@@ -21,7 +21,7 @@ def test_the_demo_resumes_after_an_interruption(tmp_path, monkeypatch):
     demo.main(tmp_path / "demo", share=0.005, samples=2, clips=10)
     assert [(fit.status, fit.step, fit.run.name) for fit in resumed] == [("finished", 2, "bom-parts")]
     rows = Evaluation.load(tmp_path / "demo" / "evaluation.json").rows
-    assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.METHODS}
+    assert rows.keys() == {"zero velocity", "nearest neighbours", *demo.STEPS}
     data = {"people.npz", "people.npz.labels.csv", "people.npz.skeleton.json"}
     names = {"evaluation.json", "futures.png", "report.html", "runs", *data}
     assert {file.name for file in (tmp_path / "demo").iterdir()} == names

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -223,6 +224,15 @@ def test_a_table_of_some_metrics_has_no_other_rows(model):
     assert result.table(["ADE"]).row_count == 2
     with pytest.raises(KeyError, match=r"no method has a score 'ADF'.*did you mean"):
         result.table(["ADF"])
+
+
+def test_more_than_five_methods_with_few_metrics_are_rows(model):
+    result = run({"dkf": model}, array_windows())
+    many = replace(result, rows={f"dkf {n}": result.rows["dkf"] for n in range(6)})
+    table = many.table(["ADE", "KL z"])
+    assert [str(column.header) for column in table.columns] == ["", "ADE ↓\nm", "KL z\nnats/step\nteacher-forced"]
+    assert table.row_count == 6
+    assert [*map(str, table.columns[1].cells)] == [str(result["dkf"]["ADE"])] * 6
 
 
 @pytest.mark.parametrize(
