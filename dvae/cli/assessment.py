@@ -218,7 +218,7 @@ def compare(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     data: str | None = None,
     missing: Expert[Missing] = False,
-    particles: int = 64,
+    particles: int = 100,
     estimates: Expert[int] = 1,
     filter_particles: Expert[int] = 0,
     contrasts: Expert[int] = 128,

@@ -36,7 +36,7 @@ def compare(
     data: HeldOutWindows | Listed | Tensor | np.ndarray | Batch,
     *,
     scores: Scores = proper,
-    particles: int = 64,
+    particles: int = 100,
     estimates: int = 1,
     filter_particles: int = 0,
     contrasts: int = 128,
