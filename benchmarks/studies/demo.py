@@ -28,7 +28,7 @@ from dvae.runs.directory import read_config, resume
 from dvae.runs.kinds import Dataset
 
 PROTOCOL = dvae.motion.Protocol("one second", observed=15, predicted=30, fps=30, train_stride=5, test_stride=15)
-STEPS = {"bom-parts": 500, "hit-dvae": 400}
+STEPS = {"bom-parts": 500, "hit-dvae": 600}
 RATES = {"bom-parts": 1e-3, "hit-dvae": 3e-3}
 
 

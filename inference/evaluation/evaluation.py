@@ -177,7 +177,7 @@ class Evaluation(Result):
         for name in metrics or ():
             if name not in self.metrics:
                 raise KeyError(f"no method has a score {name!r}{nearest(name, self.metrics)}")
-        table = Table(title=self._title(), caption=self._caption())
+        table = Table(title=self._title(), caption=self._caption(metrics))
         table.add_column("", no_wrap=True)  # on a narrow terminal numbers wrap, and names do not
         scores = {method: self[method] for method in self.rows}
         selected = {name: metric for name, metric in self.metrics.items() if metrics is None or name in metrics}
@@ -421,11 +421,19 @@ class Evaluation(Result):
         mean, deviations = linearised(cluster_means[valid], np.array(list(self.clusters.values()))[valid])
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
-    def _caption(self) -> str:
+    def _caption(self, metrics: Sequence[str] | None) -> str:
+        """Return how errors were computed, and the notes, except those that begin with a metric not in the table."""
+
+        def describes(note: str, names: Iterable[str]) -> bool:
+            subject = re.split(r"[: ]", note, maxsplit=1)[0]
+            return any(name.startswith(subject) for name in names)
+
+        others = self.metrics.keys() - set(self.metrics if metrics is None else metrics)
+        notes = [note for note in self.notes if not describes(note, others) or describes(note, metrics or ())]
         freedom = f"{len(self.clusters) - 1} degrees of freedom"
         cluster, _ = axis_names(self.data)
         error = f"mean ± standard error over windows, clustered by {cluster} ({freedom}); K: forecasts of each window"
-        return "\n".join([error, *self.notes])
+        return "\n".join([error, *notes])
 
     def _title(self) -> str:
         name = str(self.protocol.get("name", ""))

@@ -234,6 +234,8 @@ class Terminal:
     def _print(self) -> None:
         line = Text(f"step {self._step}/{self.steps}  {self._text()}")
         self.console.print(line, soft_wrap=True)
+        # a line shows validation scores only if they are new
+        self._latest = {name: value for name, value in self._latest.items() if not name.startswith("validation/")}
 
     def _text(self) -> str:
         likelihood = not any(name.startswith("energy/") for name in self._latest) or any(

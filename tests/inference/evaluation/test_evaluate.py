@@ -222,6 +222,11 @@ def test_a_table_of_some_metrics_has_no_other_rows(model):
     result = run({"dkf": model}, array_windows())
     assert result.table(["FDE", "ADE", "KL z"]).row_count == 5  # and a row for each program
     assert result.table(["ADE"]).row_count == 2
+    noted = replace(result, notes=["ADE: of this score", "scales: of all scores"])
+    assert "ADE: of this score" in str(noted.table(["ADE"]).caption)
+    caption = str(noted.table(["FDE"]).caption)
+    assert "ADE: of this score" not in caption
+    assert "scales: of all scores" in caption
     with pytest.raises(KeyError, match=r"no method has a score 'ADF'.*did you mean"):
         result.table(["ADF"])
 

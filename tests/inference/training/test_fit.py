@@ -15,6 +15,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 from safetensors.torch import load_file
 from stopping import At, interrupt
 from walks import HELD_OUT, TRAIN, build, same
@@ -28,7 +29,7 @@ from dvae.inference.training.objectives import Evidence
 from dvae.inference.training.options import Stage
 from dvae.inference.training.schedules import Piecewise, Ramp, from_config
 from dvae.inference.training.svi import NonFiniteError
-from dvae.inference.training.trackers import InMemory, JSONLines, TensorBoard
+from dvae.inference.training.trackers import InMemory, JSONLines, TensorBoard, Terminal
 from dvae.program.model import DynamicalVAE
 
 matplotlib.use("agg")
@@ -532,3 +533,15 @@ def test_a_fit_counts_the_cores_that_a_container_may_use(monkeypatch, tmp_path):
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
     with pytest.warns(UserWarning, match="torch uses 4 threads on 2 cores"):
         run(steps=2)
+
+
+def test_a_line_of_progress_shows_validation_scores_only_when_they_are_new():
+    screen = io.StringIO()
+    terminal = Terminal(30, Console(file=screen, width=200, no_color=True))
+    terminal.start(0)
+    for step in range(1, 31):
+        terminal.log(step, {"bound": 1.0, **({"validation/bound": 2.0} if step in (3, 30) else {})})
+    terminal.close()
+    lines = screen.getvalue().splitlines()
+    assert [line for line in lines if "validation" in line] == [lines[0], lines[-1]]
+    assert len(lines) == 10
