@@ -15,6 +15,7 @@ to poses, on quaternions and places, fitted to the takes of the same training se
 from __future__ import annotations
 
 import itertools
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -48,10 +49,11 @@ from dvae.motion.segments.dataset import SegmentData, subsample_clips
 from dvae.motion.segments.embodied import SHAPE, Segments
 
 from .engine import OURS, Row, fit_or_load, folder, interval, read_all, read_or_measure, spread
-from .results import DOCS, Table, refuse_unknown, tabled, write
+from .results import DOCS, Table, read, refuse_unknown, tabled, write
 
 PARTS = ("prediction", "completion", "uncertainty", "tuning")
 TUNING = "tuning"
+SUBJECT = "motion_latent_4d"
 DEVIATIONS, DESCENT = Deviations(), dvae.Descent()
 """Defaults that the part "tuning" selected."""
 SECONDS, HORIZON = 0.25, 1.2
@@ -513,56 +515,53 @@ def tables(out: Path) -> dict[str, Table]:
         available["completion-uncertainty"] = coverage_table(sure)
     if tuning := of_sights(out, tuning_settings()):
         available["completion-tuning"] = coverage_table(tuning, levels=LEVELS[1:2])
-    return {f"motion_latent_4d/{name}": table for name, table in available.items()}
+    return {f"{SUBJECT}/{name}": table for name, table in available.items()}
 
 
 @styled
-def draw(out: Path, file: Path) -> None:
-    """Draw errors over time and box plots over segments by points and by frames (figures 6 and 7 of the paper)."""
-    error_curves, completed = error_rows(out), of_sights(out, [sight for sights in SIGHTS.values() for sight in sights])
-    if not error_curves and not completed:
-        return
-    figure = new_figure(7, 2.6)
-    first, *panels = figure.subplots(1, 3)
-    highest = 0.0  # without the repeated last frame, whose errors exceed the picture
-    for name, row in error_curves.items():
-        estimates = {time: row.estimate(at(time)) for time in row.runs[0]["times"]}
-        points = {time: each for time, each in estimates.items() if each is not None}
-        means = [each.mean for each in points.values()]
-        highest = max(highest, *means) if name != STILL else highest
-        (line,) = first.plot([*points], means, label=name)
-        ends = zip(*(each.interval(error="sequences") for each in points.values()), strict=True)
-        first.fill_between([*points], *ends, color=line.get_color(), alpha=0.15, lw=0)
-    first.axvline(SECONDS, color="grey", lw=0.8, ls="--")
-    first.set(xlabel="time (s)", title="vertex error (mm)", ylim=(0, 1.2 * highest or None))
-    first.legend()
+def draw(results: Path, file: Path) -> None:
+    """Draw errors over time, and Chamfer distances by points and by frames, from the tables in a folder.
 
-    def boxes(panel: Any, across: Sequence[int], label: str, ways: Mapping[str, Sequence[Sight]]) -> None:
-        for place, (way, sights) in enumerate(ways.items()):
-            distances = {
-                n: np.concatenate(completed[s].values("chamfer")) for n, s in enumerate(sights) if s in completed
-            }
-            if distances:
-                layout = {
-                    "positions": [n + 0.25 * (place - 1) for n in distances],
-                    "widths": 0.2,
-                    "manage_ticks": False,
-                }
-                plotted = panel.boxplot(list(distances.values()), flierprops={"markersize": 2}, **layout)
-                for line in itertools.chain(*plotted.values()):
-                    line.set_color(f"C{place}")
-                panel.plot([], [], color=f"C{place}", label=way)
-        panel.set_xticks(range(len(across)), [str(value) for value in across])
+    Bands and bars are standard errors over takes and seeds (figures 6 and 7 of the paper).
+    """
+
+    def estimate(cell: str) -> tuple[float, float]:
+        mean, *errors = (float(part) for part in cell.split(" ± ") if part != "–")
+        return mean, float(np.hypot.reduce(errors)) if errors else 0.0
+
+    stored = {file.stem: read(f"{SUBJECT}/{file.stem}", results) for file in results.glob(f"{SUBJECT}/*.csv")}
+    figure = new_figure(7, 2.9)
+    first, by_points, by_frames = figure.subplots(1, 3)
+    if "prediction" in stored:
+        header, curves, _ = stored["prediction"]
+        times = [float(head.removesuffix(" s")) for head in header[1:]]
+        curves = [row for row in curves if row[0] != STILL and " minus " not in row[0] and row[0] != "segments"]
+        for name, *cells in curves:
+            known = [(time, *estimate(cell)) for time, cell in zip(times, cells, strict=True) if cell != "–"]
+            x, mean, error = np.array(known).T
+            (line,) = first.plot(x, mean, label=name)
+            first.fill_between(x, mean - error, mean + error, color=line.get_color(), alpha=0.15, lw=0)
+        first.set(xlabel="time (s)", title="vertex error (mm)", ylim=(0, None))
+        if curves:
+            first.legend()
+    completed = {}
+    for table in stored.values():
+        for row in table.rows if "Chamfer (mm)" in table.header else ():
+            if match := re.fullmatch(r"(\d+) points, (\d+) frames(, markers)?", row[0]):
+                completed[int(match[1]), int(match[2]), bool(match[3])] = estimate(row[1])
+    ways = {"points": (FEW, False), "points and markers": (FEW, True), "markers alone": (0, True)}
+    for place, (way, (few, markers)) in enumerate(ways.items()):
+        panels = {by_points: {k: e for (k, n, m), e in completed.items() if n == ALL and m == markers and k and few}}
+        panels[by_frames] = {n: e for (k, n, m), e in completed.items() if k == few and m == markers}
+        for panel, values in panels.items():
+            if values:
+                numbers = sorted(values)
+                means, errors = zip(*(values[number] for number in numbers), strict=True)
+                panel.errorbar(numbers, means, errors, marker=".", color=f"C{place}", label=way)
+    for panel, label in ((by_points, f"points in each of {ALL} frames"), (by_frames, f"frames, {FEW} points in each")):
         panel.set(xlabel=label, title="Chamfer distance (mm)", ylim=(0, None))
-
-    ways = {"points": False, "points and markers": True}
-    points = {way: [Sight(many, ALL, markers) for many in POINTS] for way, markers in ways.items()}
-    frames = {way: [Sight(FEW, many, markers) for many in FRAMES] for way, markers in ways.items()}
-    markers_only = [Sight(0, many, True) for many in FRAMES]
-    boxes(panels[0], POINTS, f"points a frame, {ALL} frames", {**points, "markers alone": [Sight(0, ALL, True)]})
-    boxes(panels[1], FRAMES, f"frames, {FEW} points in each", {**frames, "markers alone": markers_only})
-    if panels[1].get_legend_handles_labels()[1]:
-        panels[1].legend()
+    if completed:
+        by_frames.legend()
     figure.savefig(file, dpi=200)
 
 
@@ -598,7 +597,7 @@ def main(
         tuned: directory of a run fitted on file group A.
         out: directory of the measurements, in a folder per run.
         results: folder of the tables, such as benchmarks/results; None prints them.
-        picture: file of the picture of errors over time and completions.
+        picture: file of the picture of errors over time and completions, drawn if `results` is given.
         parts: prediction, completion, uncertainty, tuning.
         budget: limits of computation.
     """
@@ -622,7 +621,8 @@ def main(
         for name, choice in tuning_settings().items():
             read_or_measure(out / TUNING / f"{folder(name)}.json", partial(measure_coverage, run, *choice))
     write(results, tables(out))
-    draw(out, picture)
+    if results is not None:
+        draw(results, picture)
 
 
 if __name__ == "__main__":
