@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import repeat
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,6 +27,50 @@ DERIVATIVES = {  # derivative of each activation as a function of its output
     "relu": lambda value: (value > 0).to(value.dtype),
 }
 IN_PLACE = {"tanh": torch.Tensor.tanh_, "relu": torch.Tensor.relu_}
+
+
+class Weights(NamedTuple):
+    """Weights of a step, with biases where the loop adds them: `before` and `after` hold (weight, bias) pairs."""
+
+    before: list[tuple[Tensor, Tensor]]
+    recurrent: Tensor | None
+    first: Tensor
+    after: list[tuple[Tensor, Tensor]]
+
+
+class Buffers(NamedTuple):
+    """Tensors (T, B, ...) that the forward loop writes.
+
+    Those of the LSTM are its inputs [f_t, h_{t-1}] at T + 1 steps, its activated gates, c_t and tanh(c_t).
+    """
+
+    features: list[Tensor]
+    lstm: tuple[Tensor, Tensor, Tensor, Tensor] | None
+    hidden: list[Tensor]
+    out: Tensor
+    soft: Tensor
+    values: Tensor
+
+
+class Slopes(NamedTuple):
+    """Derivatives (T, B, ...) of all activations.
+
+    Those of the LSTM are the factors from the gradient of c_t to those of (i, f, g), from the gradient of h_t to those
+    of o and c_t, and from the gradient of c_t to that of c_{t-1}.
+    """
+
+    features: list[Tensor]
+    lstm: tuple[Tensor, Tensor, Tensor, Tensor] | None
+    hidden: list[Tensor]
+
+
+class Gradients(NamedTuple):
+    """Gradients (T, B, ...) of each layer's outputs before its activation, which the backward loop writes."""
+
+    features: list[Tensor]
+    gates: Tensor | None
+    hidden: list[Tensor]
+    out: Tensor
 
 
 def gaussian_chain(
@@ -78,12 +122,8 @@ class GaussianChain(torch.autograd.Function):
         first: Tensor,
         *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Return draws, locations, scales and states, as `gaussian_chain` does.
-
-        (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
-        """
+        """Return draws, locations, scales and states, as `gaussian_chain` does."""
         steps, batch, size = noise.shape
-        act = IN_PLACE[activation]
         before, after = _layers(tensors[: 2 * count]), _layers(tensors[2 * count :])
 
         def empty(width: int) -> Tensor:
@@ -92,191 +132,228 @@ class GaussianChain(torch.autograd.Function):
         # z = (loc + s e) + softplus(raw) e: the minimum scale s is added with the bias, outside the loop
         min_noise = min_scale * noise
         offset = torch.cat([min_noise, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
-        values, out = empty(size), empty(2 * size)
-        # softplus of both halves in one call, since on a slice it is not vectorised and takes three times as long
-        soft, zero = torch.empty_like(out), out.new_zeros(())
         features = [empty(weight.shape[0]) for weight, _ in before]
         hidden = [empty(weight.shape[1]) for weight, _ in after]
-        inputs, activated, cells, squashed = None, None, None, None
+        lstm, states = None, None
         if gates is not None and recurrent is not None:
             width = gates.shape[-1] // 4
             entering = recurrent.shape[1] - width
-            inputs = base.new_zeros(steps + 1, batch, entering + width)  # [f_t, h_{t-1}]
+            inputs = base.new_zeros(steps + 1, batch, entering + width)
             if features:
                 features[-1] = inputs[:steps, :, :entering]
-            activated, cells, squashed = empty(4 * width), empty(width), empty(width)
-            cell_steps = list(
-                zip(
-                    gates.unbind(0),
-                    inputs[:steps].unbind(0),
-                    inputs[:steps, :, :entering].unbind(0),
-                    inputs[1:, :, entering:].unbind(0),
-                    activated.unbind(0),
-                    activated[..., : 2 * width].unbind(0),
-                    *(part.unbind(0) for part in activated.split(width, dim=-1)),
-                    cells.unbind(0),
-                    squashed.unbind(0),
-                    strict=True,
-                )
-            )
-            product, carried_cell = recurrent.t(), base.new_zeros(batch, width)
-        pre = [(weight.t(), bias, f.unbind(0)) for (weight, bias), f in zip(before, features, strict=True)]
-        # layers after h_t as (bias at t, output at t), except the last one
-        targets = [*(h.unbind(0) for h in hidden), out.unbind(0)]
-        matrices = [first.t(), *(weight.t() for weight, _ in after)]
-        biases: list[Any] = [base.unbind(0), *(repeat(bias, steps) for _, bias in after)]
-        biases[-1] = offset.unbind(0)
-        post = [list(zip(*pair, strict=True)) for pair in zip(biases[:-1], targets[:-1], strict=True)]
-        last = list(
-            zip(
-                biases[-1],
-                targets[-1],
-                out[..., :size].unbind(0),
-                soft.unbind(0),
-                soft[..., size:].unbind(0),
-                noise.unbind(0),
-                values.unbind(0),
-                strict=True,
-            )
-        )
+            lstm = inputs, empty(4 * width), empty(width), empty(width)
+            states = inputs[1:, :, entering:]
         for feature in features:
             feature[0] = 0
-        value = base.new_zeros(batch, size)
-        for t in range(steps):
-            state = value
-            if t:
-                for matrix, bias, target in pre:
-                    state = act(torch.addmm(bias, state, matrix, out=target[t]))
-            elif pre:
-                state = pre[-1][2][0]
-            if inputs is not None:
-                share, entry, slot, new, gate, two, i, f, g, o, c, s = cell_steps[t]
-                if not pre and t:
-                    slot.copy_(state)
-                torch.addmm(share, entry, product, out=gate)
-                two.sigmoid_()
-                g.tanh_()
-                o.sigmoid_()
-                carried_cell = torch.mul(f, carried_cell, out=c).addcmul_(i, g)
-                state = torch.mul(o, torch.tanh(c, out=s), out=new)
-            for layer, matrix in zip(post, matrices, strict=False):
-                at_t, into = layer[t]
-                state = act(torch.addmm(at_t, state, matrix, out=into))
-            at_t, into, loc, both, scale, e, new_value = last[t]
-            torch.addmm(at_t, state, matrices[-1], out=into)
-            torch.logaddexp(into, zero, out=both)
-            value = torch.addcmul(loc, scale, e, out=new_value)
-        scales = soft[..., size:] + min_scale
-        states = None if inputs is None else inputs[1:, :, entering:]
+        weights = Weights(before, recurrent, first, after)
+        buffers = Buffers(features, lstm, hidden, empty(2 * size), empty(2 * size), empty(size))
+        _forward(noise, base, offset, gates, weights, buffers, activation)
         ctx.activation, ctx.count = activation, count
         ctx.lists = (len(features), len(hidden))
-        ctx.save_for_backward(
-            noise, values, out, recurrent, first, inputs, activated, cells, squashed, *tensors, *features, *hidden
-        )
-        return values, out[..., :size] - min_noise, scales, states
+        *_, out, soft, values = buffers
+        saved = *(lstm or (None,) * 4), *tensors, *features, *hidden
+        ctx.save_for_backward(noise, values, out, recurrent, first, *saved)
+        return values, out[..., :size] - min_noise, soft[..., size:] + min_scale, states
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the gradients of base, gates, weights and biases, given the gradients of the results of `forward`.
-
-        (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
-        """
+        """Return the gradients of base, gates, weights and biases, given the gradients of the results of `forward`."""
         noise, values, out, recurrent, first, inputs, activated, cells, squashed, *rest = ctx.saved_tensors
         n_features, n_hidden = ctx.lists
         count = ctx.count
         tensors = rest[: len(rest) - n_features - n_hidden]
         features = rest[len(tensors) : len(tensors) + n_features]
         hidden = rest[len(tensors) + n_features :]
-        before, after = _layers(tensors[: 2 * count]), _layers(tensors[2 * count :])
+        weights = Weights(_layers(tensors[: 2 * count]), recurrent, first, _layers(tensors[2 * count :]))
         steps, _, size = noise.shape
         to_value, to_loc, to_scale, to_states = gradients
         slope_of = DERIVATIVES[ctx.activation]
 
         sigmoid = torch.sigmoid(out[..., size:])
-        # the gradient of (loc, raw) is c + M * (g, g), where g is the gradient of the value, stored twice
-        factors = torch.cat([torch.ones_like(noise), noise * sigmoid], dim=-1).unbind(0)
-        offsets = torch.cat([to_loc, to_scale * sigmoid], dim=-1).unbind(0)
-        twice = torch.cat([to_value, to_value], dim=-1).unbind(0)
-        to_out = torch.empty_like(out)
-        outs = to_out.unbind(0)
-
-        # layers after h_t in reverse: weight, slope of the layer's input, gradient of that input
-        to_hidden = [torch.empty_like(h) for h in hidden]
-        back = [
-            (weight, slope_of(h).unbind(0), grad.unbind(0))
-            for (weight, _), h, grad in zip(after[::-1], hidden[::-1], to_hidden[::-1], strict=True)
-        ]
-        to_features = [f.new_zeros(f.shape) for f in features]
-        pre: list[Any] = [
-            (following, slope_of(f).unbind(0), grad.unbind(0))
-            for following, f, grad in zip(
-                [*(weight for weight, _ in before), None][1:], features, to_features, strict=True
-            )
-        ][::-1]
-        # the weight of z_{t-1}, stored twice to match (g, g)
-        entry = before[0][0] if before else first if inputs is None else recurrent[:, :size]
-        entry = torch.cat([entry, entry], dim=1)
-        to_gates = None
+        # the gradient of (loc, raw) is c + M * (g, g), where g is the gradient of the value
+        factors = torch.cat([torch.ones_like(noise), noise * sigmoid], dim=-1)
+        offsets = torch.cat([to_loc, to_scale * sigmoid], dim=-1)
+        lstm_slopes = None
         if inputs is not None:
             width = cells.shape[-1]
-            entering = inputs.shape[-1] - width
             i, f, g, o = activated.split(width, dim=-1)
             previous = torch.cat([torch.zeros_like(cells[:1]), cells[:-1]])
-            # gradient of (i, f, g) = by_cell * gradient of c_t; gradient of o = by_output * gradient of h_t
-            by_cell = torch.cat([g * i * (1 - i), previous * f * (1 - f), i * (1 - g * g)], dim=-1)
-            by_cell = by_cell.unflatten(-1, (3, width)).unbind(0)
-            by_output = (squashed * o * (1 - o)).unbind(0)
-            cell_by_state = (o * (1 - squashed * squashed)).unbind(0)
-            forget = f.unbind(0)
-            to_gates = torch.empty_like(activated)
-            three = to_gates[..., : 3 * width].unflatten(-1, (3, width)).unbind(0)
-            fourth, all_gates = to_gates[..., 3 * width :].unbind(0), to_gates.unbind(0)
-            state_gradients = to_states.unbind(0)
-            into_cell = torch.zeros_like(cells[0])
-            into_state = torch.zeros_like(cells[0])
-        carried = twice[-1]
-        for t in range(steps - 1, -1, -1):
-            gradient = torch.addcmul(offsets[t], factors[t], carried, out=outs[t])
-            for matrix, slope, target in back:
-                gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
-            if inputs is not None:
-                to_state = torch.add(state_gradients[t], into_state).addmm_(gradient, first)
-                into_cell = torch.addcmul(into_cell, to_state, cell_by_state[t])
-                torch.mul(by_cell[t], into_cell.unsqueeze(1), out=three[t])
-                torch.mul(by_output[t], to_state, out=fourth[t])
-                if not t:
-                    break
-                into_cell = into_cell * forget[t]
-                if pre:
-                    to_inputs = torch.mm(all_gates[t], recurrent)
-                    into_state = to_inputs[:, entering:]
-                    gradient = torch.mul(to_inputs[:, :entering], pre[0][1][t], out=pre[0][2][t])
-                else:
-                    gradient = all_gates[t]
-                    into_state = torch.mm(gradient, recurrent[:, entering:])
-            elif not t:
-                break
-            elif pre:
-                gradient = torch.mm(gradient, first, out=pre[0][2][t]).mul_(pre[0][1][t])
-            for matrix, slope, target in pre[1:]:
-                gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
-            carried = torch.addmm(twice[t - 1], gradient, entry)
+            by_cell = torch.stack([g * i * (1 - i), previous * f * (1 - f), i * (1 - g * g)], dim=-2)
+            lstm_slopes = by_cell, squashed * o * (1 - o), o * (1 - squashed * squashed), f
+        slopes = Slopes([slope_of(f) for f in features], lstm_slopes, [slope_of(h) for h in hidden])
+        to = Gradients(
+            [f.new_zeros(f.shape) for f in features],
+            None if inputs is None else torch.empty_like(activated),
+            [torch.empty_like(h) for h in hidden],
+            torch.empty_like(out),
+        )
+        _backward(factors, offsets, to_value, to_states, weights, slopes, to)
 
         earlier = torch.cat([torch.zeros_like(values[:1]), values[:-1]])
-        to_layers = [*to_hidden, to_out]  # gradient of each layer's output
+        to_layers = [*to.hidden, to.out]  # gradient of each layer's output
         to_recurrent = None
-        if to_gates is None:
+        if to.gates is None:
             to_first = _product(to_layers[0], features[-1] if features else earlier)
         else:
-            to_first = _product(to_layers[0], inputs[1:, :, entering:])
-            to_recurrent = _product(to_gates, inputs[:steps])
+            to_first = _product(to_layers[0], inputs[1:, :, -width:])
+            to_recurrent = _product(to.gates, inputs[:steps])
         to_tensors: list[Tensor] = []
-        for grad, entered in zip(to_features, [earlier, *features], strict=False):
+        for grad, entered in zip(to.features, [earlier, *features], strict=False):
             to_tensors += [_product(grad[1:], entered[1:]), grad[1:].sum((0, 1))]
         for grad, entered in zip(to_layers[1:], hidden, strict=True):
             to_tensors += [_product(grad, entered), grad.sum((0, 1))]
-        return None, to_layers[0], to_gates, None, None, None, to_recurrent, to_first, *to_tensors
+        return None, to_layers[0], to.gates, None, None, None, to_recurrent, to_first, *to_tensors
+
+
+def _forward(
+    noise: Tensor,
+    base: Tensor,
+    offset: Tensor,
+    gates: Tensor | None,
+    weights: Weights,
+    buffers: Buffers,
+    activation: str,
+) -> None:
+    """Run the forward loop with torch's operations, and write to `buffers`.
+
+    (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
+    """
+    before, recurrent, first, after = weights
+    features, lstm, hidden, out, soft, values = buffers
+    steps, batch, size = noise.shape
+    act = IN_PLACE[activation]
+    zero = out.new_zeros(())
+    if lstm is not None and gates is not None and recurrent is not None:
+        inputs, activated, cells, squashed = lstm
+        width = cells.shape[-1]
+        entering = inputs.shape[-1] - width
+        cell_steps = list(
+            zip(
+                gates.unbind(0),
+                inputs[:steps].unbind(0),
+                inputs[:steps, :, :entering].unbind(0),
+                inputs[1:, :, entering:].unbind(0),
+                activated.unbind(0),
+                activated[..., : 2 * width].unbind(0),
+                *(part.unbind(0) for part in activated.split(width, dim=-1)),
+                cells.unbind(0),
+                squashed.unbind(0),
+                strict=True,
+            )
+        )
+        product, carried_cell = recurrent.t(), base.new_zeros(batch, width)
+    pre = [(weight.t(), bias, f.unbind(0)) for (weight, bias), f in zip(before, features, strict=True)]
+    # layers after h_t as (bias at t, output at t), except the last one
+    targets = [*(h.unbind(0) for h in hidden), out.unbind(0)]
+    matrices = [first.t(), *(weight.t() for weight, _ in after)]
+    biases: list[Any] = [base.unbind(0), *(repeat(bias, steps) for _, bias in after)]
+    biases[-1] = offset.unbind(0)
+    post = [list(zip(*pair, strict=True)) for pair in zip(biases[:-1], targets[:-1], strict=True)]
+    last = list(
+        zip(
+            biases[-1],
+            targets[-1],
+            out[..., :size].unbind(0),
+            soft.unbind(0),
+            soft[..., size:].unbind(0),
+            noise.unbind(0),
+            values.unbind(0),
+            strict=True,
+        )
+    )
+    value = base.new_zeros(batch, size)
+    for t in range(steps):
+        state = value
+        if t:
+            for matrix, bias, target in pre:
+                state = act(torch.addmm(bias, state, matrix, out=target[t]))
+        elif pre:
+            state = pre[-1][2][0]
+        if lstm is not None:
+            share, entry, slot, new, gate, two, i, f, g, o, c, s = cell_steps[t]
+            if not pre and t:
+                slot.copy_(state)
+            torch.addmm(share, entry, product, out=gate)
+            two.sigmoid_()
+            g.tanh_()
+            o.sigmoid_()
+            carried_cell = torch.mul(f, carried_cell, out=c).addcmul_(i, g)
+            state = torch.mul(o, torch.tanh(c, out=s), out=new)
+        for layer, matrix in zip(post, matrices, strict=False):
+            at_t, into = layer[t]
+            state = act(torch.addmm(at_t, state, matrix, out=into))
+        at_t, into, loc, both, scale, e, new_value = last[t]
+        torch.addmm(at_t, state, matrices[-1], out=into)
+        # softplus of both halves in one call, since on a slice it is not vectorised and takes three times as long
+        torch.logaddexp(into, zero, out=both)
+        value = torch.addcmul(loc, scale, e, out=new_value)
+
+
+def _backward(
+    factors: Tensor,
+    offsets: Tensor,
+    to_value: Tensor,
+    to_states: Tensor | None,
+    weights: Weights,
+    slopes: Slopes,
+    to: Gradients,
+) -> None:
+    """Run the backward loop with torch's operations, and write to `to`."""
+    before, recurrent, first, after = weights
+    size = to_value.shape[-1]
+    # the gradient of the value is stored twice, for (g, g)
+    twice = torch.cat([to_value, to_value], dim=-1).unbind(0)
+    factors_at, offsets_at, outs = factors.unbind(0), offsets.unbind(0), to.out.unbind(0)
+    # layers after h_t in reverse: weight, slope of the layer's input, gradient of that input
+    back = [
+        (weight, slope.unbind(0), grad.unbind(0))
+        for (weight, _), slope, grad in zip(after[::-1], slopes.hidden[::-1], to.hidden[::-1], strict=True)
+    ]
+    pre: list[Any] = [
+        (following, slope.unbind(0), grad.unbind(0))
+        for following, slope, grad in zip(
+            [*(weight for weight, _ in before), None][1:], slopes.features, to.features, strict=True
+        )
+    ][::-1]
+    # the weight of z_{t-1}, stored twice to match (g, g)
+    entry = before[0][0] if before else first if recurrent is None else recurrent[:, :size]
+    entry = torch.cat([entry, entry], dim=1)
+    if slopes.lstm is not None and recurrent is not None and to.gates is not None and to_states is not None:
+        width = to_states.shape[-1]
+        entering = recurrent.shape[1] - width
+        by_cell, by_output, cell_by_state, forget = (slope.unbind(0) for slope in slopes.lstm)
+        three = to.gates[..., : 3 * width].unflatten(-1, (3, width)).unbind(0)
+        fourth, all_gates = to.gates[..., 3 * width :].unbind(0), to.gates.unbind(0)
+        state_gradients = to_states.unbind(0)
+        into_cell = into_state = offsets.new_zeros(to_states.shape[1:])
+    carried = twice[-1]
+    for t in range(len(twice) - 1, -1, -1):
+        gradient = torch.addcmul(offsets_at[t], factors_at[t], carried, out=outs[t])
+        for matrix, slope, target in back:
+            gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
+        if recurrent is not None:
+            to_state = torch.add(state_gradients[t], into_state).addmm_(gradient, first)
+            into_cell = torch.addcmul(into_cell, to_state, cell_by_state[t])
+            torch.mul(by_cell[t], into_cell.unsqueeze(1), out=three[t])
+            torch.mul(by_output[t], to_state, out=fourth[t])
+            if not t:
+                break
+            into_cell = into_cell * forget[t]
+            if pre:
+                to_inputs = torch.mm(all_gates[t], recurrent)
+                into_state = to_inputs[:, entering:]
+                gradient = torch.mul(to_inputs[:, :entering], pre[0][1][t], out=pre[0][2][t])
+            else:
+                gradient = all_gates[t]
+                into_state = torch.mm(gradient, recurrent[:, entering:])
+        elif not t:
+            break
+        elif pre:
+            gradient = torch.mm(gradient, first, out=pre[0][2][t]).mul_(pre[0][1][t])
+        for matrix, slope, target in pre[1:]:
+            gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
+        carried = torch.addmm(twice[t - 1], gradient, entry)
 
 
 def _layers(tensors: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
