@@ -10,67 +10,33 @@ All terms that do not depend on z_{t-1} are computed before the loop. A step of 
 The forward loop writes to preallocated tensors. The backward loop is written by hand. It computes the derivatives of
 all activations at all steps at once, so each step needs only its products and a few elementwise operations. The
 gradient of each weight is one product over all steps.
+
+On a GPU, `chain_kernel` can run each of the two loops as one Triton kernel; `KERNEL` selects it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import repeat
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from .chain_tensors import Buffers, Gradients, Slopes, Weights
 
 DERIVATIVES = {  # derivative of each activation as a function of its output
     "tanh": lambda value: torch.addcmul(torch.ones((), dtype=value.dtype, device=value.device), value, value, value=-1),
     "relu": lambda value: (value > 0).to(value.dtype),
 }
 IN_PLACE = {"tanh": torch.Tensor.tanh_, "relu": torch.Tensor.relu_}
+KERNEL: str | None = None
+"""Device type on which Triton kernels run the loops: "cuda", or None for no kernels.
 
-
-class Weights(NamedTuple):
-    """Weights of a step, with biases where the loop adds them: `before` and `after` hold (weight, bias) pairs."""
-
-    before: list[tuple[Tensor, Tensor]]
-    recurrent: Tensor | None
-    first: Tensor
-    after: list[tuple[Tensor, Tensor]]
-
-
-class Buffers(NamedTuple):
-    """Tensors (T, B, ...) that the forward loop writes.
-
-    Those of the LSTM are its inputs [f_t, h_{t-1}] at T + 1 steps, its activated gates, c_t and tanh(c_t).
-    """
-
-    features: list[Tensor]
-    lstm: tuple[Tensor, Tensor, Tensor, Tensor] | None
-    hidden: list[Tensor]
-    out: Tensor
-    soft: Tensor
-    values: Tensor
-
-
-class Slopes(NamedTuple):
-    """Derivatives (T, B, ...) of all activations.
-
-    Those of the LSTM are the factors from the gradient of c_t to those of (i, f, g), from the gradient of h_t to those
-    of o and c_t, and from the gradient of c_t to that of c_{t-1}.
-    """
-
-    features: list[Tensor]
-    lstm: tuple[Tensor, Tensor, Tensor, Tensor] | None
-    hidden: list[Tensor]
-
-
-class Gradients(NamedTuple):
-    """Gradients (T, B, ...) of each layer's outputs before its activation, which the backward loop writes."""
-
-    features: list[Tensor]
-    gates: Tensor | None
-    hidden: list[Tensor]
-    out: Tensor
+They are off by default, because they were only tested with Triton's interpreter. Chains that they do not support, and
+all chains without Triton, run the loops of torch's operations.
+"""
 
 
 def gaussian_chain(
@@ -147,7 +113,9 @@ class GaussianChain(torch.autograd.Function):
             feature[0] = 0
         weights = Weights(before, recurrent, first, after)
         buffers = Buffers(features, lstm, hidden, empty(2 * size), empty(2 * size), empty(size))
-        _forward(noise, base, offset, gates, weights, buffers, activation)
+        ctx.kernel = _kernel(noise, base, gates, weights)
+        loop = ctx.kernel.run_forward if ctx.kernel else _forward
+        loop(noise, base, offset, gates, weights, buffers, activation)
         ctx.activation, ctx.count = activation, count
         ctx.lists = (len(features), len(hidden))
         *_, out, soft, values = buffers
@@ -188,7 +156,8 @@ class GaussianChain(torch.autograd.Function):
             [torch.empty_like(h) for h in hidden],
             torch.empty_like(out),
         )
-        _backward(factors, offsets, to_value, to_states, weights, slopes, to)
+        loop = ctx.kernel.run_backward if ctx.kernel else _backward
+        loop(factors, offsets, to_value, to_states, weights, slopes, to)
 
         earlier = torch.cat([torch.zeros_like(values[:1]), values[:-1]])
         to_layers = [*to.hidden, to.out]  # gradient of each layer's output
@@ -204,6 +173,17 @@ class GaussianChain(torch.autograd.Function):
         for grad, entered in zip(to_layers[1:], hidden, strict=True):
             to_tensors += [_product(grad, entered), grad.sum((0, 1))]
         return None, to_layers[0], to.gates, None, None, None, to_recurrent, to_first, *to_tensors
+
+
+def _kernel(noise: Tensor, base: Tensor, gates: Tensor | None, weights: Weights) -> Any:
+    """Return the module `chain_kernel` if it can run the loops of these tensors, otherwise None."""
+    if noise.device.type != KERNEL:
+        return None
+    try:
+        from . import chain_kernel
+    except ImportError:  # Triton comes with torch's builds for CUDA only
+        return None
+    return chain_kernel if chain_kernel.supports(noise, base, gates, weights) else None
 
 
 def _forward(
