@@ -329,7 +329,7 @@ class DynamicalVAE(nn.Module):
         size: int = 1,
         prefix: Mapping[str, Tensor] | None = None,
         mean_emission: bool | Collection[str] = False,
-        scheduled_sampling: ScheduledSampling | InputNoise | float | None = None,
+        scheduled_sampling: ScheduledSampling | InputNoise | float | Tensor | None = None,
         draws: Mapping[str, int] | None = None,
         curriculum: float = 1.0,
     ) -> dict[str, Tensor]:
@@ -380,7 +380,7 @@ class DynamicalVAE(nn.Module):
         rollout.prefix = prefixed
         names = self.observed if mean_emission else ()
         rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
-        if isinstance(scheduled_sampling, int | float):
+        if isinstance(scheduled_sampling, int | float | Tensor):
             scheduled_sampling = self.feeding.at(scheduled_sampling)
         rollout.feeding = scheduled_sampling
         for block in self.generative.blocks:
@@ -681,7 +681,7 @@ class DynamicalVAE(nn.Module):
         size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
         for name, spec in self.shared.items():
             if name not in data:
-                distribution = spec.distribution(self.sizes[name], curriculum)
+                distribution = spec.distribution(self.sizes[name], curriculum, like(self).device)
                 value = one[name] if name in one else pyro.sample(name, distribution, infer=SHARED)
                 data[name] = memoize(
                     self, [value, size], partial(self._expand_shared, value, size)

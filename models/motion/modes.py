@@ -36,9 +36,10 @@ from ...motion import HUMAN36M, HUMANEVA, Skeleton
 from ...motion.data.protocols import Poses
 from ...networks import Input, Network, NetworkSpec
 from ...networks.base import perceptron
-from ...networks.loop import memoize
+from ...networks.loop import memoize, store_result
 from ...options import Size, flat
 from ...program.batch import CHUNK, AnyBatch, repeat, rows
+from ...program.groups import Groups
 from ...program.rollout import Rollout
 from ..baselines.cvae import CVAE, SummaryDecoder
 from ..registry import configured
@@ -217,8 +218,14 @@ class ModesModel(FutureModel):
         """
         size = len(data[HISTORY])
         codes = self._one_hot(modes.repeat_interleave(size), data[HISTORY])
-        group = torch.arange(size, device=codes.device).repeat(len(modes))
-        return Batch(repeat(data, len(modes))) | {MODE: codes, "group": group}
+        windows = torch.arange(size, device=codes.device)
+        group = windows.repeat(len(modes))
+        count = torch.full_like(group, len(modes))
+        # known here; to find either in the values would synchronise with a GPU
+        store_result(self.reader, [group], Groups(group, windows, count))
+        repeated = Batch(repeat(data, len(modes)))
+        store_result(self.sampler.past, [repeated[HISTORY]], len(modes) == self.modes)
+        return repeated | {MODE: codes, "group": group}
 
     def _one_hot(self, modes: Tensor, like: Tensor) -> Tensor:
         """Return one-hot codes (B, K) of modes (B,), with the type and device of `like`."""
@@ -414,7 +421,11 @@ class Sampler(nn.Module):
 
         def compute() -> Tensor:
             count, remainder = divmod(len(history), self.modes)
-            is_repeated = not remainder and torch.equal(history[count:], history[:-count])
+
+            def is_equal() -> bool:
+                return not remainder and torch.equal(history[count:], history[:-count])
+
+            is_repeated = memoize(self.past, [history], is_equal)  # `in_modes` stores it
             parameters: Tensor = self.heads(self.behind(self.past(history[:count] if is_repeated else history)))
             return parameters.unflatten(1, (self.modes, -1))
 

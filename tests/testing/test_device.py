@@ -77,11 +77,11 @@ def segments():
 def small_method(request, people):
     """Return a function of a method's name: a small model, its recipe, training windows and test windows."""
 
-    def make(name):
+    def make(name, steps=4):
         torch.manual_seed(0)
         if name == "motion-latent":
             method, train = MotionLatent(**SMALL[name]), request.getfixturevalue("segments")
-            return method.build(train), method.train(train, None, 4), train, None
+            return method.build(train), method.train(train, None, steps), train, None
         of_paths = issubclass(dvae.methods()[name], TrajectoryMethod)
         protocol = motion.PROTOCOLS["simulated-trajectories" if of_paths else "simulated"]
         cut = {"predicted": 8, "observed": min(protocol.observed, 6), "train_stride": 15, "test_stride": 25}
@@ -89,7 +89,7 @@ def small_method(request, people):
         data = motion.MotionData("simulated", people, replace(protocol, **cut))
         train = data.windows("train")
         method = dvae.method(name, **SMALL.get(name, {"latent": 4, "warm_up": 1})).resolve_defaults(train)
-        model, recipe = method.build(data.schema), method.train(train, None, 4)
+        model, recipe = method.build(data.schema), method.train(train, None, steps)
         recipe.prepare(model)
         return model, recipe, train, data.windows("test")
 
