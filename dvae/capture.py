@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -23,8 +23,8 @@ WARM_UP = 3
 """Calls of a kind before its graph is recorded; libraries allocate memory and choose algorithms in the first ones."""
 SYNCHRONIZES = "called a synchronizing CUDA operation"
 """Warning of torch for a synchronisation."""
-LARGEST = 16
-"""Largest number of graphs, each with the memory of one call."""
+MOST_GRAPHS, MOST_KINDS = 16, 1000
+"""Largest number of graphs, each with the memory of one call, and of kinds whose calls are counted."""
 
 _CHECKS: ContextVar[list[Tensor] | None] = ContextVar("checks", default=None)
 
@@ -57,6 +57,11 @@ def defer(failed: Tensor) -> bool:
     return checks is not None
 
 
+def any_failed(checks: list[Tensor], device: torch.device) -> Tensor:
+    """Return a boolean scalar, True if any of the collected checks has failed."""
+    return torch.stack(checks).any() if checks else torch.zeros((), dtype=torch.bool, device=device)
+
+
 class _HostDraws(TorchDispatchMode):
     """Mode that lists the random operations on the CPU, whose results a graph would repeat."""
 
@@ -67,11 +72,8 @@ class _HostDraws(TorchDispatchMode):
     @override
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
-        if (
-            torch.Tag.nondeterministic_seeded in func.tags
-            and isinstance(result, Tensor)
-            and result.device.type == "cpu"
-        ):
+        results = result if isinstance(result, tuple) else (result,)
+        if torch.Tag.nondeterministic_seeded in func.tags and any(each.device.type == "cpu" for each in results):
             self.names.append(f"{func} draws on the CPU")
         return result
 
@@ -99,7 +101,7 @@ class Captured:
         self.stream: Any = torch.cuda.Stream(device)
         self.obstacles = dict[Hashable, list[str]]()
         self._calls = Counter[Hashable]()
-        self._graphs = dict[Hashable, tuple[Any, dict[str, Tensor], dict[str, Tensor]]]()
+        self.graphs = dict[Hashable, tuple[Any, dict[str, Tensor], dict[str, Tensor]]]()
 
     def __call__(self, kind: Hashable, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the results of the function; those of a graph are overwritten by its next replay.
@@ -109,21 +111,23 @@ class Captured:
             inputs: tensors by name, on the CPU or the GPU.
         """
         kind = (kind, *((name, value.shape, value.dtype) for name, value in inputs.items()))
-        if kind in self._graphs:
-            graph, memory, results = self._graphs[kind]
+        if kind in self.graphs:
+            graph, memory, results = self.graphs[kind]
             for name, value in inputs.items():
                 memory[name].copy_(value, non_blocking=True)
             graph.replay()
             return results
         device_inputs = {name: value.to(self.device, non_blocking=True) for name, value in inputs.items()}
+        if len(self._calls) > MOST_KINDS:
+            self._calls.clear()
         self._calls[kind] += 1
-        if kind in self.obstacles or len(self._graphs) == LARGEST or self._calls[kind] <= WARM_UP:
+        if kind in self.obstacles or len(self.graphs) == MOST_GRAPHS or self._calls[kind] <= WARM_UP:
             return self._run(kind, device_inputs)
         memory = {name: value.clone() for name, value in device_inputs.items()}
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, stream=self.stream):
             results = self.function(memory)
-        self._graphs[kind] = graph, memory, results
+        self.graphs[kind] = graph, memory, results
         graph.replay()
         return results
 
@@ -131,30 +135,26 @@ class Captured:
         """Run the function without a graph, and find obstacles in the last warm-up calls."""
         if self._calls[kind] > WARM_UP:
             return self.function(inputs)
-        current = torch.cuda.current_stream(self.device)
+        current, draws, caught = torch.cuda.current_stream(self.device), _HostDraws(), list[warnings.WarningMessage]()
         self.stream.wait_stream(current)
         with torch.cuda.stream(self.stream), ExitStack() as stack:  # the stream of the recording
             if self._calls[kind] == WARM_UP - 1:
-                draws = stack.enter_context(_HostDraws()).names
-                results = self.function(inputs)
-                self._refuse(kind, draws)
+                stack.enter_context(draws)
             elif self._calls[kind] == WARM_UP:
                 caught = stack.enter_context(_synchronizations())
-                results = self.function(inputs)
-                places = (f"{each.filename}:{each.lineno}" for each in caught if SYNCHRONIZES in str(each.message))
-                self._refuse(kind, [f"{place} reads a value of the GPU, or uploads one" for place in places])
-            else:
-                results = self.function(inputs)
+            results = self.function(inputs)
         current.wait_stream(self.stream)
-        return results
-
-    def _refuse(self, kind: Hashable, obstacles: Iterable[str]) -> None:
-        """Never record calls of a kind that has obstacles, and warn of the first such kind."""
-        if distinct := list(dict.fromkeys(obstacles)):
+        places = [f"{each.filename}:{each.lineno}" for each in caught if SYNCHRONIZES in str(each.message)]
+        for each in caught:
+            if SYNCHRONIZES not in str(each.message):
+                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+        obstacles = [*draws.names, *(f"{place} reads a value of the GPU, or uploads one" for place in places)]
+        if obstacles:
             if not self.obstacles:
-                reasons = "; ".join(distinct)
-                warnings.warn(f"{self.name} runs without a CUDA graph: {reasons}", stacklevel=7)
-            self.obstacles[kind] = distinct
+                reasons = "; ".join(dict.fromkeys(obstacles))
+                warnings.warn(f"{self.name} runs without a CUDA graph: {reasons}", stacklevel=5)
+            self.obstacles[kind] = obstacles
+        return results
 
 
 @contextmanager

@@ -167,7 +167,7 @@ class Tape:
     """A simulated `torch.cuda.CUDAGraph`."""
 
     def __init__(self) -> None:
-        self.calls: list[tuple[Any, Any, Any, list[Tensor]]] = []
+        self.calls: list[tuple[Any, Any, Any, bool, list[Tensor]]] = []
         self._own: set[int] = set()  # storages that the recording allocates
         self._changed: dict[int, tuple[Tensor, Tensor]] = {}  # other storages that it writes to, and their values
 
@@ -190,7 +190,7 @@ class Tape:
         new = {tensor.untyped_storage().data_ptr() for tensor in results} - before
         self._own |= new
         if new or not results or (func._schema.is_mutable and torch.Tag.inplace_view not in func.tags):
-            self.calls.append((*call, [tensor.detach() for tensor in results]))
+            self.calls.append((*call, torch.is_grad_enabled(), [tensor.detach() for tensor in results]))
         return result
 
     def end(self, random_state: Tensor) -> None:
@@ -201,8 +201,8 @@ class Tape:
 
     def replay(self) -> None:
         """Run the recorded operations again, with results in the recorded tensors."""
-        with no_dispatch(), torch.no_grad():
-            for func, args, kwargs, recorded in self.calls:
+        for func, args, kwargs, is_training, recorded in self.calls:
+            with no_dispatch(), torch.set_grad_enabled(is_training):  # oneDNN has other kernels in training
                 for before, now in zip(recorded, _tensors([func(*args, **kwargs)]), strict=True):
                     if now.data_ptr() != before.data_ptr():
                         before.copy_(now)
@@ -291,7 +291,7 @@ def on_device() -> Iterator[Traffic]:
     lifting = torch._C._only_lift_cpu_tensors()
     with ExitStack() as stack:
         for name in ("_lazy_init", "get_rng_state", "set_rng_state"):  # all draws use the random state of the CPU
-            stack.enter_context(mock.patch.object(torch.cuda, name, return_value=torch.empty(0)))
+            stack.enter_context(mock.patch.object(torch.cuda, name, return_value=torch.empty(0, dtype=torch.uint8)))
         torch._C._set_only_lift_cpu_tensors(True)  # so that torch.tensor(..., device=...) moves them with `to`
         stack.callback(torch._C._set_only_lift_cpu_tensors, lifting)
         traffic = stack.enter_context(Traffic())

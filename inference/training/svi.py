@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ...capture import Captured, deferring
+from ...capture import Captured, any_failed, deferring
 from ...data.batch import Batch
 from ...data.sequences import Batched, as_batches, refuse_table, tensor_of
 from ...locking import no_fork, seeded, serialized
@@ -182,14 +182,23 @@ class SVI:
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             self.random = self._random_state()
         self._state, self._stage_objective = State(self.model), {}
-        self._captured: Captured | None = None
+        self.captured = self._capture()
         self._recorded: tuple[Stage, dict[str, float], list[str]] | None = None
-        if training.cuda_graph and self.fabric.device.type == "cuda":
-            if self.fabric.world_size > 1:
-                warnings.warn("several processes exchange gradients, which a CUDA graph cannot repeat", stacklevel=2)
-            else:
-                self._captured = Captured(self._record, "the training step", self.fabric.device)
         return self._state
+
+    def _capture(self) -> Captured | None:
+        """Return the step as a function for CUDA graphs, or None without the option, a GPU, or a constant program."""
+        if not self.training.cuda_graph or self.fabric.device.type != "cuda":
+            return None
+        obstacles = ["processes exchange their gradients"] if self.fabric.world_size > 1 else []
+        for objective in {id(stage.objective): stage.objective for stage in self.plan}.values():
+            if not isinstance(objective, WeightedObjective):
+                name = getattr(objective, "__name__", type(objective).__name__)
+                obstacles.append(f"{name} has no weights as `WeightedObjective` does")
+        if obstacles:
+            warnings.warn(f"the training step runs without a CUDA graph: {'; '.join(obstacles)}", stacklevel=3)
+            return None
+        return Captured(self._record, "the training step", self.fabric.device)
 
     @serialized
     @torch.inference_mode(False)
@@ -205,14 +214,12 @@ class SVI:
         Raises:
             NonFiniteError: when the loss or a gradient is NaN or infinite; the weights do not change.
         """
-        state, objective, rates = self.state, self.objective, self.rates(self.state.step)
+        state, rates = self.state, self.rates(self.state.step)
         stage = stage_at(self.plan, state.step)[1]
         if not self.model.training:
             self.module.train()
         converted = self._convert(batch)
-        take = self._step
-        if self._captured is not None and isinstance(objective, WeightedObjective):
-            take = self._replay
+        take = self._step if self.captured is None else self._replay
         state.terms = take(converted, stage, rates)
         state.step += 1
         return state.terms
@@ -275,7 +282,7 @@ class SVI:
 
     def _replay(self, batch: Batch, stage: Stage, rates: Mapping[str, float]) -> Terms:
         """Take a step as `_step` does, by a CUDA graph if there is one for this kind of batch and stage."""
-        assert self._captured is not None
+        assert self.captured is not None
         assert isinstance(self.objective, WeightedObjective)
         weights = self.objective.weights(self.state.step)
         sampling, curriculum = rates["scheduled_sampling"], rates.get("curriculum")
@@ -286,7 +293,7 @@ class SVI:
         inputs = {"numbers": torch.tensor(numbers, dtype=torch.float64), **batch.leaves()}
         with self.drawing():
             kind = stage_at(self.plan, self.state.step)[0], *constant.items()
-            results = self._captured(kind, inputs)
+            results = self.captured(kind, inputs)
         *verdict, is_invalid = results["numbers"].tolist()
         if is_invalid:  # the program itself raises the error of its check
             self._terms(batch, stage.objective, f"step {self.state.step + 1}", sampling, curriculum)
@@ -324,7 +331,7 @@ class SVI:
         weights = numbers[2:].to(terms.n_steps.dtype).unbind()
         loss = objective.loss(terms, dict(zip(names, weights, strict=True)))
         gradients, verdict = self._differentiate(loss, terms, stage)
-        is_invalid = torch.stack(checks).any() if checks else torch.zeros_like(verdict[0], dtype=torch.bool)
+        is_invalid = any_failed(checks, verdict.device)
         is_refused = is_invalid | ~torch.isfinite(verdict[2])
         if self.training.gradient_clip is not None:
             torch._foreach_mul_(gradients, (self.training.gradient_clip / verdict[1]).clamp(max=1))

@@ -67,7 +67,7 @@ def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> T
         sequence, future = valid.nonzero(as_tuple=True)
     else:  # all futures, because finding the valid ones would synchronise with a GPU
         every = torch.arange(valid.numel(), device=valid.device)
-        sequence, future = every // futures, every % futures
+        sequence, future = every // valid.shape[1], every % valid.shape[1]
     counts = valid[sequence, future]
     truths = pseudo[sequence, future].masked_fill(~counts[:, None, None], 0)
     with torch.no_grad():  # ||x - y||^2 - ||y||^2 = ||x||^2 - 2 x y, relative to one sample to avoid cancellation
