@@ -309,7 +309,9 @@ class TestCapturedStep:
 
     def svi(self, cuda_graph, **options):
         torch.manual_seed(0)
-        model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3}).double()
+        model = dvae.DynamicalVAE(
+            "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3}
+        ).double()
         svi = dvae.SVI(move(model) if cuda_graph else model, steps=20, progress=False, cuda_graph=cuda_graph, **options)
         svi.init()
         return svi
@@ -362,7 +364,9 @@ class TestCapturedStep:
         def model():
             torch.manual_seed(0)
             sizes = {"z": 2, "x": 3}
-            return move(dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", sizes).double())
+            return move(
+                dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_t)", sizes).double()
+            )
 
         with simulated_gpu():
             whole = dvae.fit(model(), data, steps=12, **options)
