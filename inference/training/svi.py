@@ -187,10 +187,12 @@ class SVI:
         return self._state
 
     def _capture(self) -> Captured | None:
-        """Return the step as a function for CUDA graphs, or None without the option, a GPU, or a constant program."""
-        if not self.training.cuda_graph or self.fabric.device.type != "cuda":
+        """Return the step as a function for CUDA graphs; None without the option, or if something prevents them."""
+        if not self.training.cuda_graph:
             return None
-        obstacles = ["processes exchange their gradients"] if self.fabric.world_size > 1 else []
+        kind = self.fabric.device.type
+        obstacles = [] if kind == "cuda" else [f"the device is a {kind}"]
+        obstacles += ["processes exchange their gradients"] if self.fabric.world_size > 1 else []
         for objective in {id(stage.objective): stage.objective for stage in self.plan}.values():
             if not isinstance(objective, WeightedObjective):
                 name = getattr(objective, "__name__", type(objective).__name__)

@@ -270,13 +270,13 @@ def steps_of(svi, recipe, count):
 def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
     """Draws are equal bit for bit, and terms up to rounding."""
     count, runs = 12 if name == "mix-and-match" else 7, []  # a curriculum has a graph only once it is constant
-    for on_gpu_too in (False, True):
+    for simulated in (False, True):
         model, recipe, _, _ = small_method(name, count)
         options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False}
         options["learning_rate"] = 2**-10  # exact in float32, in which graphs read it
-        with simulated_gpu() if on_gpu_too else nullcontext():
-            svi = dvae.SVI(move(model.double()) if on_gpu_too else model.double(), stages=recipe.stages, **options)
-            svi.training = replace(svi.training, cuda_graph=on_gpu_too)
+        with simulated_gpu() if simulated else nullcontext():
+            model = move(model.double()) if simulated else model.double()
+            svi = dvae.SVI(model, stages=recipe.stages, cuda_graph=simulated, **options)
             svi.init()
             runs.append((steps_of(svi, recipe, count), svi.random["torch"]))
     torch.testing.assert_close(runs[1][0], runs[0][0], rtol=1e-7, atol=1e-7)
@@ -288,6 +288,23 @@ def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
     else:
         assert not obstacles
         assert svi.captured.graphs
+
+
+@on_gpu
+@pytest.mark.filterwarnings("ignore:the training step runs without a CUDA graph")
+@pytest.mark.parametrize("name", METHODS)
+def test_replayed_steps_on_a_gpu_equal_steps_without_graphs(name, small_method):
+    """In single precision, over 50 steps; the random states are equal."""
+    count, runs = 50, []
+    for cuda_graph in (False, True):
+        model, recipe, _, _ = small_method(name, count)
+        options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False, "accelerator": "cuda"}
+        svi = dvae.SVI(model, stages=recipe.stages, cuda_graph=cuda_graph, **options)
+        svi.init()
+        runs.append((steps_of(svi, recipe, count), svi.random))
+    assert bool(svi.captured.graphs) == (name not in UNCAPTURED)
+    torch.testing.assert_close(runs[1][0], runs[0][0], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(runs[1][1], runs[0][1], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("name", ["srnn", "hit-dvae", "gsps", "trajevae", "mix-and-match", "dlow"])
@@ -390,6 +407,11 @@ class TestCapturedStep:
 
         with simulated_gpu(), pytest.warns(UserWarning, match="without a CUDA graph: objective has no weights"):
             assert self.svi(True, objective=objective).captured is None
+
+    def test_a_processor_has_no_graphs(self):
+        svi = dvae.SVI(torch.nn.Linear(1, 1), cuda_graph=True, accelerator="cpu")
+        with pytest.warns(UserWarning, match="without a CUDA graph: the device is a cpu"):
+            svi.init()
 
 
 class TestCaptured:
