@@ -15,7 +15,6 @@ gradient of each weight is one product over all steps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import repeat
 from typing import Any
 
 import torch
@@ -91,12 +90,15 @@ class GaussianChain(torch.autograd.Function):
 
         # z = (loc + s e) + softplus(raw) e: the minimum scale s is added with the bias, outside the loop
         min_noise = min_scale * noise
-        offset = torch.cat([min_noise, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
-        values, out = empty(size), empty(2 * size)
+        # Each step adds its products in place to the terms known before the loop. `addmm` with `out` copies these terms
+        # at every step, which takes as long as the product.
+        out = torch.cat([min_noise, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
+        known = [base, *(bias.expand(steps, batch, -1) for _, bias in after)][: len(after)]
+        hidden = [terms.clone(memory_format=torch.contiguous_format) for terms in known]
+        values = empty(size)
         # softplus of both halves in one call, since on a slice it is not vectorised and takes three times as long
         soft, zero = torch.empty_like(out), out.new_zeros(())
         features = [empty(weight.shape[0]) for weight, _ in before]
-        hidden = [empty(weight.shape[1]) for weight, _ in after]
         inputs, activated, cells, squashed = None, None, None, None
         if gates is not None and recurrent is not None:
             width = gates.shape[-1] // 4
@@ -104,10 +106,10 @@ class GaussianChain(torch.autograd.Function):
             inputs = base.new_zeros(steps + 1, batch, entering + width)  # [f_t, h_{t-1}]
             if features:
                 features[-1] = inputs[:steps, :, :entering]
-            activated, cells, squashed = empty(4 * width), empty(width), empty(width)
+            activated = gates.clone(memory_format=torch.contiguous_format)
+            cells, squashed = empty(width), empty(width)
             cell_steps = list(
                 zip(
-                    gates.unbind(0),
                     inputs[:steps].unbind(0),
                     inputs[:steps, :, :entering].unbind(0),
                     inputs[1:, :, entering:].unbind(0),
@@ -121,16 +123,11 @@ class GaussianChain(torch.autograd.Function):
             )
             product, carried_cell = recurrent.t(), base.new_zeros(batch, width)
         pre = [(weight.t(), bias, f.unbind(0)) for (weight, bias), f in zip(before, features, strict=True)]
-        # layers after h_t as (bias at t, output at t), except the last one
-        targets = [*(h.unbind(0) for h in hidden), out.unbind(0)]
         matrices = [first.t(), *(weight.t() for weight, _ in after)]
-        biases: list[Any] = [base.unbind(0), *(repeat(bias, steps) for _, bias in after)]
-        biases[-1] = offset.unbind(0)
-        post = [list(zip(*pair, strict=True)) for pair in zip(biases[:-1], targets[:-1], strict=True)]
+        post = [h.unbind(0) for h in hidden]
         last = list(
             zip(
-                biases[-1],
-                targets[-1],
+                out.unbind(0),
                 out[..., :size].unbind(0),
                 soft.unbind(0),
                 soft[..., size:].unbind(0),
@@ -150,21 +147,19 @@ class GaussianChain(torch.autograd.Function):
             elif pre:
                 state = pre[-1][2][0]
             if inputs is not None:
-                share, entry, slot, new, gate, two, i, f, g, o, c, s = cell_steps[t]
+                entry, slot, new, gate, two, i, f, g, o, c, s = cell_steps[t]
                 if not pre and t:
                     slot.copy_(state)
-                torch.addmm(share, entry, product, out=gate)
+                gate.addmm_(entry, product)
                 two.sigmoid_()
                 g.tanh_()
                 o.sigmoid_()
                 carried_cell = torch.mul(f, carried_cell, out=c).addcmul_(i, g)
                 state = torch.mul(o, torch.tanh(c, out=s), out=new)
             for layer, matrix in zip(post, matrices, strict=False):
-                at_t, into = layer[t]
-                state = act(torch.addmm(at_t, state, matrix, out=into))
-            at_t, into, loc, both, scale, e, new_value = last[t]
-            torch.addmm(at_t, state, matrices[-1], out=into)
-            torch.logaddexp(into, zero, out=both)
+                state = act(layer[t].addmm_(state, matrix))
+            into, loc, both, scale, e, new_value = last[t]
+            torch.logaddexp(into.addmm_(state, matrices[-1]), zero, out=both)
             value = torch.addcmul(loc, scale, e, out=new_value)
         scales = soft[..., size:] + min_scale
         states = None if inputs is None else inputs[1:, :, entering:]
@@ -196,10 +191,9 @@ class GaussianChain(torch.autograd.Function):
         sigmoid = torch.sigmoid(out[..., size:])
         # the gradient of (loc, raw) is c + M * (g, g), where g is the gradient of the value, stored twice
         factors = torch.cat([torch.ones_like(noise), noise * sigmoid], dim=-1).unbind(0)
-        offsets = torch.cat([to_loc, to_scale * sigmoid], dim=-1).unbind(0)
-        twice = torch.cat([to_value, to_value], dim=-1).unbind(0)
-        to_out = torch.empty_like(out)
+        to_out = torch.cat([to_loc, to_scale * sigmoid], dim=-1)
         outs = to_out.unbind(0)
+        twice = torch.cat([to_value, to_value], dim=-1).unbind(0)
 
         # layers after h_t in reverse: weight, slope of the layer's input, gradient of that input
         to_hidden = [torch.empty_like(h) for h in hidden]
@@ -237,7 +231,7 @@ class GaussianChain(torch.autograd.Function):
             into_state = torch.zeros_like(cells[0])
         carried = twice[-1]
         for t in range(steps - 1, -1, -1):
-            gradient = torch.addcmul(offsets[t], factors[t], carried, out=outs[t])
+            gradient = outs[t].addcmul_(factors[t], carried)
             for matrix, slope, target in back:
                 gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
             if inputs is not None:
@@ -261,7 +255,7 @@ class GaussianChain(torch.autograd.Function):
                 gradient = torch.mm(gradient, first, out=pre[0][2][t]).mul_(pre[0][1][t])
             for matrix, slope, target in pre[1:]:
                 gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
-            carried = torch.addmm(twice[t - 1], gradient, entry)
+            carried = twice[t - 1].addmm_(gradient, entry)
 
         earlier = torch.cat([torch.zeros_like(values[:1]), values[:-1]])
         to_layers = [*to_hidden, to_out]  # gradient of each layer's output
