@@ -4,6 +4,7 @@
 # make studies   the scripts of the result pages on little data, the scores that are stored, and the longer notebooks
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make coverage   the tests, and which lines none of them runs
+# make gpu     on a machine with a GPU: its tests, and the speed of training steps; 10 minutes
 # make bench   the benchmarks, beside their targets and the last release; as JSON in bench.json; on a GPU with DEVICE=cuda
 # make notebooks   runs the notebooks and stores them with what they show
 # make docs    the site, in docs/_build/html
@@ -33,7 +34,7 @@ torch = @test `uname` != Linux || command -v nvidia-smi > /dev/null || $(pip_tor
 	echo "pip finds no torch for the CPU alone and takes the one for CUDA; see TORCH_INDEX in CONTRIBUTING.md"; \
 	$(pip_torch) $(TORCH)
 
-.PHONY: venv demo lint quick test studies fuzz coverage bench notebooks docs dist clean
+.PHONY: venv demo lint quick test studies fuzz coverage gpu bench notebooks docs dist clean
 
 venv: .venv/installed
 
@@ -75,6 +76,10 @@ fuzz: venv
 
 coverage: venv
 	$(BIN)/pytest -n 2 --cov --cov-report=term-missing:skip-covered --cov-fail-under=97
+
+gpu: venv
+	$(BIN)/pytest -n 4 -k "gpu or kernel"
+	$(BIN)/python -m benchmarks.bench graphs speed --device cuda --keep
 
 DEVICE := cpu
 

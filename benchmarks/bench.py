@@ -34,7 +34,7 @@ from .studies.results import RESULTS, Table, refuse_unknown, require_gpu, write
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
 NAMES = ("speed", "gsps", "hit_dvae", "mix_and_match", "trajevae")
-NAMES += ("completion", "startup", "files", "mapped", "scaling")
+NAMES += ("completion", "startup", "files", "mapped", "scaling", "graphs")
 PROCESSORS = {
     "speed: segments": "says what one core does",
     "gsps: memory": "is the process's, not the device's",
@@ -44,6 +44,8 @@ PROCESSORS = {
     "scaling": "is of processes that share the cores",
 }
 """Rows or whole benchmarks that a GPU skips, with the reason."""
+GPUS = {"graphs": "is of CUDA graphs"}
+"""The same for a processor."""
 WORSE = 1.1
 Target = tuple[str, float | None]
 Targets = Mapping[str, Target]
@@ -236,9 +238,8 @@ def main(
     failed: list[str] = []
     for name in names:
         print(f"{name} ...", flush=True)
-        left_out = {
-            row: reason for row, reason in PROCESSORS.items() if device != "cpu" and row.partition(":")[0] == name
-        }
+        skipped = GPUS if device == "cpu" else PROCESSORS
+        left_out = {row: reason for row, reason in skipped.items() if row.partition(":")[0] == name}
         for row, reason in left_out.items():
             print(f"  {row} is left out: it {reason}", flush=True)
         if name in left_out:

@@ -105,6 +105,18 @@ class Batch(dict[str, Any]):
             tensors |= {name: value} if inner is None else {f"{name}/{key}": each for key, each in inner.items()}
         return tensors
 
+    @classmethod
+    def from_leaves(cls, leaves: Mapping[str, Any]) -> Batch:
+        """Return the batch with these tensors by path, the inverse of `leaves`."""
+        batch = cls()
+        for path, value in leaves.items():
+            name, _, inner = path.partition("/")
+            if inner:
+                batch.setdefault(name, {})[inner] = value
+            else:
+                batch[name] = value
+        return batch
+
     def __setitem__(self, name: str, value: Any) -> None:
         self.reader = None
         super().__setitem__(name, value)

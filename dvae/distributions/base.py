@@ -209,7 +209,8 @@ class ConditionalDistribution(nn.Module):
             Parameters with the same shapes, in the variable's own unit.
         """
         loc, *rest = parameters
-        return torch.addcmul(mean, loc, scale), *(rest[:1] and [rest[0] * scale]), *rest[1:]
+        scales = [(unexpanded(each) * scale).expand_as(loc) for each in rest[:1]]
+        return torch.addcmul(mean, loc, scale), *scales, *rest[1:]
 
     def noise(self, shape: Sequence[int], like: Tensor) -> Tensor:
         """Return noise for all steps at once, by default standard normal; `draw` transforms it into values.
@@ -231,6 +232,13 @@ class ConditionalDistribution(nn.Module):
         """
         distribution = self.distribution(parameters)
         return distribution.rsample() if distribution.has_rsample else distribution.sample()
+
+
+def unexpanded(parameter: Tensor) -> Tensor:
+    """Return a parameter (..., D) without the first dimensions if it has been expanded to them, such as (D,)."""
+    while parameter.dim() > 1 and (len(parameter) == 1 or not parameter.stride(0)):
+        parameter = parameter[0]
+    return parameter
 
 
 def is_real(support: Any) -> bool:

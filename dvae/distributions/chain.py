@@ -17,7 +17,6 @@ On a GPU, `chain_kernel` can run each of the two loops as one Triton kernel; `KE
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import repeat
 from typing import Any
 
 import torch
@@ -97,9 +96,12 @@ class GaussianChain(torch.autograd.Function):
 
         # z = (loc + s e) + softplus(raw) e: the minimum scale s is added with the bias, outside the loop
         min_noise = min_scale * noise
-        offset = torch.cat([min_noise, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
+        # Each step adds its products in place to the terms known before the loop. `addmm` with `out` copies these terms
+        # at every step, which takes as long as the product.
+        out = torch.cat([min_noise, torch.zeros_like(noise)], dim=-1) + (after[-1][1] if after else base)
+        known = [base, *(bias.expand(steps, batch, -1) for _, bias in after)][: len(after)]
+        hidden = [terms.clone(memory_format=torch.contiguous_format) for terms in known]
         features = [empty(weight.shape[0]) for weight, _ in before]
-        hidden = [empty(weight.shape[1]) for weight, _ in after]
         lstm, states = None, None
         if gates is not None and recurrent is not None:
             width = gates.shape[-1] // 4
@@ -107,18 +109,18 @@ class GaussianChain(torch.autograd.Function):
             inputs = base.new_zeros(steps + 1, batch, entering + width)
             if features:
                 features[-1] = inputs[:steps, :, :entering]
-            lstm = inputs, empty(4 * width), empty(width), empty(width)
+            lstm = inputs, gates.clone(memory_format=torch.contiguous_format), empty(width), empty(width)
             states = inputs[1:, :, entering:]
         for feature in features:
             feature[0] = 0
         weights = Weights(before, recurrent, first, after)
-        buffers = Buffers(features, lstm, hidden, empty(2 * size), empty(2 * size), empty(size))
+        buffers = Buffers(features, lstm, hidden, out, torch.empty_like(out), empty(size))
         ctx.kernel = _kernel(noise, base, gates, weights)
         loop = ctx.kernel.run_forward if ctx.kernel else _forward
-        loop(noise, base, offset, gates, weights, buffers, activation)
+        loop(noise, weights, buffers, activation)
         ctx.activation, ctx.count = activation, count
         ctx.lists = (len(features), len(hidden))
-        *_, out, soft, values = buffers
+        soft, values = buffers.soft, buffers.values
         saved = *(lstm or (None,) * 4), *tensors, *features, *hidden
         ctx.save_for_backward(noise, values, out, recurrent, first, *saved)
         return values, out[..., :size] - min_noise, soft[..., size:] + min_scale, states
@@ -141,7 +143,6 @@ class GaussianChain(torch.autograd.Function):
         sigmoid = torch.sigmoid(out[..., size:])
         # the gradient of (loc, raw) is c + M * (g, g), where g is the gradient of the value
         factors = torch.cat([torch.ones_like(noise), noise * sigmoid], dim=-1)
-        offsets = torch.cat([to_loc, to_scale * sigmoid], dim=-1)
         lstm_slopes = None
         if inputs is not None:
             width = cells.shape[-1]
@@ -154,10 +155,10 @@ class GaussianChain(torch.autograd.Function):
             [f.new_zeros(f.shape) for f in features],
             None if inputs is None else torch.empty_like(activated),
             [torch.empty_like(h) for h in hidden],
-            torch.empty_like(out),
+            torch.cat([to_loc, to_scale * sigmoid], dim=-1),
         )
         loop = ctx.kernel.run_backward if ctx.kernel else _backward
-        loop(factors, offsets, to_value, to_states, weights, slopes, to)
+        loop(factors, to_value, to_states, weights, slopes, to)
 
         earlier = torch.cat([torch.zeros_like(values[:1]), values[:-1]])
         to_layers = [*to.hidden, to.out]  # gradient of each layer's output
@@ -186,15 +187,7 @@ def _kernel(noise: Tensor, base: Tensor, gates: Tensor | None, weights: Weights)
     return chain_kernel if chain_kernel.supports(noise, base, gates, weights) else None
 
 
-def _forward(
-    noise: Tensor,
-    base: Tensor,
-    offset: Tensor,
-    gates: Tensor | None,
-    weights: Weights,
-    buffers: Buffers,
-    activation: str,
-) -> None:
+def _forward(noise: Tensor, weights: Weights, buffers: Buffers, activation: str) -> None:
     """Run the forward loop with torch's operations, and write to `buffers`.
 
     (Over 60 lines, because the tensors of the loop are too many to pass between functions.)
@@ -204,13 +197,12 @@ def _forward(
     steps, batch, size = noise.shape
     act = IN_PLACE[activation]
     zero = out.new_zeros(())
-    if lstm is not None and gates is not None and recurrent is not None:
+    if lstm is not None and recurrent is not None:
         inputs, activated, cells, squashed = lstm
         width = cells.shape[-1]
         entering = inputs.shape[-1] - width
         cell_steps = list(
             zip(
-                gates.unbind(0),
                 inputs[:steps].unbind(0),
                 inputs[:steps, :, :entering].unbind(0),
                 inputs[1:, :, entering:].unbind(0),
@@ -222,18 +214,13 @@ def _forward(
                 strict=True,
             )
         )
-        product, carried_cell = recurrent.t(), base.new_zeros(batch, width)
+        product, carried_cell = recurrent.t(), cells.new_zeros(batch, width)
     pre = [(weight.t(), bias, f.unbind(0)) for (weight, bias), f in zip(before, features, strict=True)]
-    # layers after h_t as (bias at t, output at t), except the last one
-    targets = [*(h.unbind(0) for h in hidden), out.unbind(0)]
     matrices = [first.t(), *(weight.t() for weight, _ in after)]
-    biases: list[Any] = [base.unbind(0), *(repeat(bias, steps) for _, bias in after)]
-    biases[-1] = offset.unbind(0)
-    post = [list(zip(*pair, strict=True)) for pair in zip(biases[:-1], targets[:-1], strict=True)]
+    post = [h.unbind(0) for h in hidden]
     last = list(
         zip(
-            biases[-1],
-            targets[-1],
+            out.unbind(0),
             out[..., :size].unbind(0),
             soft.unbind(0),
             soft[..., size:].unbind(0),
@@ -242,7 +229,7 @@ def _forward(
             strict=True,
         )
     )
-    value = base.new_zeros(batch, size)
+    value = out.new_zeros(batch, size)
     for t in range(steps):
         state = value
         if t:
@@ -251,28 +238,25 @@ def _forward(
         elif pre:
             state = pre[-1][2][0]
         if lstm is not None:
-            share, entry, slot, new, gate, two, i, f, g, o, c, s = cell_steps[t]
+            entry, slot, new, gate, two, i, f, g, o, c, s = cell_steps[t]
             if not pre and t:
                 slot.copy_(state)
-            torch.addmm(share, entry, product, out=gate)
+            gate.addmm_(entry, product)
             two.sigmoid_()
             g.tanh_()
             o.sigmoid_()
             carried_cell = torch.mul(f, carried_cell, out=c).addcmul_(i, g)
             state = torch.mul(o, torch.tanh(c, out=s), out=new)
         for layer, matrix in zip(post, matrices, strict=False):
-            at_t, into = layer[t]
-            state = act(torch.addmm(at_t, state, matrix, out=into))
-        at_t, into, loc, both, scale, e, new_value = last[t]
-        torch.addmm(at_t, state, matrices[-1], out=into)
+            state = act(layer[t].addmm_(state, matrix))
+        into, loc, both, scale, e, new_value = last[t]
         # softplus of both halves in one call, since on a slice it is not vectorised and takes three times as long
-        torch.logaddexp(into, zero, out=both)
+        torch.logaddexp(into.addmm_(state, matrices[-1]), zero, out=both)
         value = torch.addcmul(loc, scale, e, out=new_value)
 
 
 def _backward(
     factors: Tensor,
-    offsets: Tensor,
     to_value: Tensor,
     to_states: Tensor | None,
     weights: Weights,
@@ -284,7 +268,7 @@ def _backward(
     size = to_value.shape[-1]
     # the gradient of the value is stored twice, for (g, g)
     twice = torch.cat([to_value, to_value], dim=-1).unbind(0)
-    factors_at, offsets_at, outs = factors.unbind(0), offsets.unbind(0), to.out.unbind(0)
+    factors_at, outs = factors.unbind(0), to.out.unbind(0)
     # layers after h_t in reverse: weight, slope of the layer's input, gradient of that input
     back = [
         (weight, slope.unbind(0), grad.unbind(0))
@@ -306,10 +290,10 @@ def _backward(
         three = to.gates[..., : 3 * width].unflatten(-1, (3, width)).unbind(0)
         fourth, all_gates = to.gates[..., 3 * width :].unbind(0), to.gates.unbind(0)
         state_gradients = to_states.unbind(0)
-        into_cell = into_state = offsets.new_zeros(to_states.shape[1:])
+        into_cell = into_state = to.out.new_zeros(to_states.shape[1:])
     carried = twice[-1]
     for t in range(len(twice) - 1, -1, -1):
-        gradient = torch.addcmul(offsets_at[t], factors_at[t], carried, out=outs[t])
+        gradient = outs[t].addcmul_(factors_at[t], carried)
         for matrix, slope, target in back:
             gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
         if recurrent is not None:
@@ -333,7 +317,7 @@ def _backward(
             gradient = torch.mm(gradient, first, out=pre[0][2][t]).mul_(pre[0][1][t])
         for matrix, slope, target in pre[1:]:
             gradient = torch.mm(gradient, matrix, out=target[t]).mul_(slope[t])
-        carried = torch.addmm(twice[t - 1], gradient, entry)
+        carried = twice[t - 1].addmm_(gradient, entry)
 
 
 def _layers(tensors: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:

@@ -52,25 +52,16 @@ def supports(noise: Tensor, base: Tensor, gates: Tensor | None, weights: Weights
     )
 
 
-def run_forward(
-    noise: Tensor,
-    base: Tensor,
-    offset: Tensor,
-    gates: Tensor | None,
-    weights: Weights,
-    buffers: Buffers,
-    activation: str,
-) -> None:
+def run_forward(noise: Tensor, weights: Weights, buffers: Buffers, activation: str) -> None:
     """Run the forward loop, and write to `buffers`."""
     features, lstm, hidden, *results = buffers
     stored = tuple(features[:-1] if lstm else features)  # an LSTM's inputs contain the last ones
     written = stored, *(lstm or (None,) * 4), tuple(hidden), *results
-    _launch(_forward, noise, weights, [noise, base, offset, gates], written, RELU=activation == "relu")
+    _launch(_forward, noise, weights, [noise], written, RELU=activation == "relu")
 
 
 def run_backward(
     factors: Tensor,
-    offsets: Tensor,
     to_value: Tensor,
     to_states: Tensor | None,
     weights: Weights,
@@ -79,7 +70,7 @@ def run_backward(
 ) -> None:
     """Run the backward loop, and write to `to`."""
     lstm = slopes.lstm or (None,) * 4
-    read = [factors, offsets, to_value, *lstm, to_states, slopes.features, slopes.hidden]
+    read = [factors, to_value, *lstm, to_states, slopes.features, slopes.hidden]
     _launch(_backward, to_value, weights, read, (tuple(to.features), to.gates, tuple(to.hidden), to.out))
 
 
@@ -217,7 +208,7 @@ def _forward(
     RELU: tl.constexpr,
 ) -> None:
     before, recurrent, first, last = weights
-    noise, base, offset, gates = read
+    noise = read[0]
     features, inputs, activated, cells, squashed, hidden, out, soft, values = written
     D: tl.constexpr = SIZES[0]
     F: tl.constexpr = SIZES[len(before)]
@@ -244,7 +235,7 @@ def _forward(
             _store(inputs, rows, valid, F, F + W, state)
             activations: tl.tuple = ()
             for k in tl.static_range(4):
-                gate = _load(gates + k * W, rows, valid, W, 4 * W)
+                gate = _load(activated + k * W, rows, valid, W, 4 * W)
                 gate += _product(state, entering[k]) + _product(output, carried[k])
                 gate = _tanh(gate) if k == 2 else _sigmoid(gate)
                 _store(activated + k * W, rows, valid, W, 4 * W, gate)
@@ -257,10 +248,10 @@ def _forward(
             _store(inputs + F, rows + batch, valid, W, F + W, output)
             state = output
         if len(hidden) > 0:
-            state = _activate(_load(base, rows, valid, H, H) + _product(state, to_hidden), RELU)
+            state = _activate(_load(hidden[0], rows, valid, H, H) + _product(state, to_hidden), RELU)
             _store(hidden[0], rows, valid, H, H, state)
-        loc = _load(offset, rows, valid, D, 2 * D) + _product(state, to_loc)
-        raw = _load(offset + D, rows, valid, D, 2 * D) + _product(state, to_raw)
+        loc = _load(out, rows, valid, D, 2 * D) + _product(state, to_loc)
+        raw = _load(out + D, rows, valid, D, 2 * D) + _product(state, to_raw)
         scale = _softplus(raw)
         value = loc + scale * _load(noise, rows, valid, D, D)
         _store(out, rows, valid, D, 2 * D, loc)
@@ -282,7 +273,7 @@ def _backward(
     ROWS: tl.constexpr,
 ) -> None:
     before, recurrent, first, last = weights
-    factors, offsets, to_value, by_cell, by_output, cell_by_state, forget, to_states, slopes, hidden_slopes = read
+    factors, to_value, by_cell, by_output, cell_by_state, forget, to_states, slopes, hidden_slopes = read
     to_features, to_gates, to_hidden, to_out = written
     D: tl.constexpr = SIZES[0]
     matrices, entering, carried, by_loc, by_raw = _weights(before, recurrent, last, SIZES, W, H, False)
@@ -296,8 +287,8 @@ def _backward(
     for step in range(steps):
         rows = (steps - 1 - step) * batch + block
         into_value += _load(to_value, rows, valid, D, D)
-        to_loc = _load(offsets, rows, valid, D, 2 * D) + into_value
-        to_raw = _load(offsets + D, rows, valid, D, 2 * D) + _load(factors + D, rows, valid, D, 2 * D) * into_value
+        to_loc = _load(to_out, rows, valid, D, 2 * D) + into_value
+        to_raw = _load(to_out + D, rows, valid, D, 2 * D) + _load(factors + D, rows, valid, D, 2 * D) * into_value
         _store(to_out, rows, valid, D, 2 * D, to_loc)
         _store(to_out + D, rows, valid, D, 2 * D, to_raw)
         gradient = _product(to_loc, by_loc) + _product(to_raw, by_raw)

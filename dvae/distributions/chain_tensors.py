@@ -17,7 +17,7 @@ class Weights(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Tensors (T, B, ...) that the forward loop writes.
+    """Tensors (T, B, ...) that the forward loop writes; `hidden`, `out` and the gates contain the known terms before.
 
     Those of the LSTM are its inputs [f_t, h_{t-1}] at T + 1 steps, its activated gates, c_t and tanh(c_t).
     """
@@ -43,7 +43,10 @@ class Slopes(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients (T, B, ...) of each layer's outputs before its activation, which the backward loop writes."""
+    """Gradients (T, B, ...) of each layer's outputs before its activation, which the backward loop writes.
+
+    Before, `out` contains the gradients from the locations and scales.
+    """
 
     features: list[Tensor]
     gates: Tensor | None

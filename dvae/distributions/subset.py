@@ -48,17 +48,20 @@ class Subset:
         """
         return ceil(self.share * size - 1e-9)  # rounding error must not turn 0.3 * 10 into 4
 
-    def distribution(self, size: int, curriculum: float = 1.0) -> SubsetDistribution:
+    def distribution(
+        self, size: int, curriculum: float = 1.0, device: torch.device | None = None
+    ) -> SubsetDistribution:
         """Return the distribution of vectors (L,) that are 1 at chosen indices and 0 elsewhere.
 
         Args:
             size: L, number of indices.
             curriculum: progress of the curriculum, from 0 (the first indices) to 1 (a uniform draw).
+            device: device of the draws.
         """
         n_chosen = self.chosen(size)
         most = round(n_chosen * (size - n_chosen) / size)
         swapped = int(curriculum * most)
-        return SubsetDistribution(size, n_chosen, None if curriculum >= 1 else swapped)
+        return SubsetDistribution(size, n_chosen, None if curriculum >= 1 else swapped, device)
 
 
 class SubsetDistribution(TorchDistribution):
@@ -68,6 +71,7 @@ class SubsetDistribution(TorchDistribution):
         size: L, number of indices.
         ones: number of ones.
         swapped: number of ones that are not among the first `ones` indices; None for any number.
+        device: device of the draws.
 
     Raises:
         ValueError: there are no vectors with these numbers of ones.
@@ -76,13 +80,13 @@ class SubsetDistribution(TorchDistribution):
     arg_constraints: ClassVar[dict[str, Any]] = {}
     support = constraints.independent(constraints.boolean, 1)
 
-    def __init__(self, size: int, ones: int, swapped: int | None = None) -> None:
+    def __init__(self, size: int, ones: int, swapped: int | None = None, device: torch.device | None = None) -> None:
         if not 0 <= ones <= size or not 0 <= (swapped or 0) <= min(ones, size - ones):
             raise ValueError(
                 "`ones` must be from 0 to `size`, and `swapped` from 0 to min(ones, size - ones); "
                 f"got size={size}, ones={ones}, swapped={swapped}"
             )
-        self.size, self.ones, self.swapped = size, ones, swapped
+        self.size, self.ones, self.swapped, self.device = size, ones, swapped, device
         super().__init__(torch.Size(), torch.Size([size]), validate_args=False)
 
     @lazy_property
@@ -96,9 +100,14 @@ class SubsetDistribution(TorchDistribution):
     def sample(self, sample_shape: Any = ()) -> Tensor:
         shape = torch.Size(sample_shape)
         if self.swapped is None:
-            return _random_subset(shape, self.size, self.ones)
-        first = 1 - _random_subset(shape, self.ones, self.swapped)
-        return torch.cat([first, _random_subset(shape, self.size - self.ones, self.swapped)], -1)
+            return self._draw(shape, self.size, self.ones)
+        first = 1 - self._draw(shape, self.ones, self.swapped)
+        return torch.cat([first, self._draw(shape, self.size - self.ones, self.swapped)], -1)
+
+    def _draw(self, shape: torch.Size, size: int, count: int) -> Tensor:
+        """Return a tensor (*shape, size) of zeros with ones at `count` random indices of the last dimension."""
+        positions = torch.rand(*shape, size, device=self.device).argsort(-1)[..., :count]
+        return torch.zeros(*shape, size, device=self.device).scatter(-1, positions, 1.0)
 
     @override
     def log_prob(self, value: Tensor) -> Tensor:
@@ -106,12 +115,6 @@ class SubsetDistribution(TorchDistribution):
         if self.swapped is not None:
             valid &= value[..., self.ones :].sum(-1) == self.swapped
         return torch.where(valid, -self._log_number, -torch.inf).to(value.dtype)
-
-
-def _random_subset(shape: torch.Size, size: int, count: int) -> Tensor:
-    """Return a tensor (*shape, size) of zeros with ones at `count` random indices of the last dimension."""
-    positions = torch.rand(*shape, size).argsort(-1)[..., :count]
-    return torch.zeros(*shape, size).scatter(-1, positions, 1.0)
 
 
 def _log_choose(size: int, count: int) -> float:

@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 
 class Rows(Sequence[Any]):
@@ -153,9 +152,10 @@ def shift(values: Tensor, lag: int) -> Tensor:
     if lag == 0:
         return values
     steps = values.shape[1]
-    shifted = values[:, max(lag, 0) : steps + min(lag, 0)] if abs(lag) < steps else values[:, :0]
     gap = min(abs(lag), steps)
-    return functional.pad(shifted, (0, 0, gap, 0) if lag < 0 else (0, 0, 0, gap))
+    zeros = torch.zeros_like(values[:, :gap])
+    # faster than `pad`, which also fills the other steps with zeros
+    return torch.cat([zeros, values[:, : steps - gap]] if lag < 0 else [values[:, gap:], zeros], dim=1)
 
 
 def at(values: Sequence[Tensor], t: int, like: Tensor, size: int) -> Tensor:

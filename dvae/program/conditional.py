@@ -419,7 +419,8 @@ class Conditional(nn.Module):
             min_scale=self.head.min_scale,
             activation=join.kind,
         )
-        value, *parameters = map(back, results)
+        # elementwise operations on transposed tensors of few coordinates are not vectorised
+        value, *parameters = (back(each).contiguous() for each in results)
         if form.keep is not None and states is not None:
             form.keep(value, back(states))
         return value, tuple(parameters)

@@ -69,8 +69,9 @@ def forecast(
         inputs, fixed_part = (repeat(rows(each, part), count) for each in (data, fixed))
         observed = rows(past_data, part) if forked else repeat(rows(past_data, part), count)
         for name in redrawn:
-            distribution, some = model.shared[name].distribution(model.sizes[name]), len(inputs[name]) // count
-            inputs[name] = observed[name] = distribution.sample((count,)).to(inputs[name]).repeat_interleave(some, 0)
+            some, device = len(inputs[name]) // count, like(model).device
+            draws = model.shared[name].distribution(model.sizes[name], device=device).sample((count,))
+            inputs[name] = observed[name] = draws.to(inputs[name]).repeat_interleave(some, 0)
         latents = {name: value for name, value in fixed_part.items() if name in model.latents}
         if past:
             latents = poutine.condition(model.guide, latents)(observed, draws=dict.fromkeys(forked, count))

@@ -18,6 +18,8 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints, kl_divergence, register_kl
 
+from ..capture import is_deferring
+
 
 @dataclass(frozen=True)
 class Groups:
@@ -42,6 +44,10 @@ class Groups:
         """
         if index.dim() != 1 or index.is_floating_point():
             raise ValueError(f"'group' of the batch is {index.dtype} {tuple(index.shape)}; expected integers (B,)")
+        if is_deferring():  # `unique` reads the number of groups; here, each sequence has a place for one
+            equal = index[:, None] == index
+            place = equal.int().argmax(1)
+            return cls(place, torch.arange(len(place), device=place.device), equal.sum(1))
         _, place, count = torch.unique(index, return_inverse=True, return_counts=True)
         rows = torch.arange(len(place), device=place.device)
         # the smallest row: with several writes to one place, the last one is undefined on a GPU

@@ -42,6 +42,9 @@ from .forecast import forecast, impute, reconstruct, states
 from .rollout import InputNoise, Rollout, ScheduledSampling
 
 _COUNT = itertools.count()
+# Between steps, glibc may return freed memory to the system, which costs up to a quarter of a training step in page
+# faults. Freeing a block of just under 32 MiB raises its limit for this to 64 MiB (M_MMAP_THRESHOLD in mallopt(3)).
+torch.empty(2**25 - 2**14, dtype=torch.uint8, device="cpu")
 SHARED: Any = {"shared": True}
 """The `infer` entry that marks the site of a variable shared by all sequences."""
 
@@ -329,7 +332,7 @@ class DynamicalVAE(nn.Module):
         size: int = 1,
         prefix: Mapping[str, Tensor] | None = None,
         mean_emission: bool | Collection[str] = False,
-        scheduled_sampling: ScheduledSampling | InputNoise | float | None = None,
+        scheduled_sampling: ScheduledSampling | InputNoise | float | Tensor | None = None,
         draws: Mapping[str, int] | None = None,
         curriculum: float = 1.0,
     ) -> dict[str, Tensor]:
@@ -380,7 +383,7 @@ class DynamicalVAE(nn.Module):
         rollout.prefix = prefixed
         names = self.observed if mean_emission else ()
         rollout.mean_emission = names if isinstance(mean_emission, bool) else mean_emission
-        if isinstance(scheduled_sampling, int | float):
+        if isinstance(scheduled_sampling, int | float | Tensor):
             scheduled_sampling = self.feeding.at(scheduled_sampling)
         rollout.feeding = scheduled_sampling
         for block in self.generative.blocks:
@@ -681,7 +684,7 @@ class DynamicalVAE(nn.Module):
         size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
         for name, spec in self.shared.items():
             if name not in data:
-                distribution = spec.distribution(self.sizes[name], curriculum)
+                distribution = spec.distribution(self.sizes[name], curriculum, like(self).device)
                 value = one[name] if name in one else pyro.sample(name, distribution, infer=SHARED)
                 data[name] = memoize(
                     self, [value, size], partial(self._expand_shared, value, size)

@@ -20,6 +20,7 @@ from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
+from ..capture import is_deferring
 from ..distributions.base import Parameters
 from ..factorization.notation import Block, Factorization
 from ..networks.base import indicator, presence
@@ -34,7 +35,7 @@ class ScheduledSampling:
     """Scheduled sampling: the model's own means replace frames of the data's history (Bengio et al., 2015).
 
     Args:
-        probability: probability of each frame, independently.
+        probability: probability of each frame, independently; within a CUDA graph, a scalar tensor.
         passes: None computes the means step by step, which is exact. A number of passes approximates this in parallel:
             each pass computes the means of all steps at once from the history of the previous pass (T passes are
             exact). If the model has several data variables, each reads the means of earlier variables from the same
@@ -56,27 +57,33 @@ class ScheduledSampling:
         >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), scheduled_sampling=own)
     """
 
-    probability: float
+    probability: float | Tensor
     passes: int | None = None
     gradient: bool = True
     start: int = 0
     blocks: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.probability <= 1 or (self.passes is not None and self.passes < 1) or self.start < 0:
+        is_share = isinstance(self.probability, Tensor) or 0 <= self.probability <= 1
+        if not is_share or (self.passes is not None and self.passes < 1) or self.start < 0:
             raise ValueError(
                 f"expected a probability in [0, 1], at least one pass and a start of at least 0, got {self}"
             )
         if self.blocks is not None and (len(self.blocks) != 2 or min(self.blocks) < 1):
             raise ValueError(f"blocks must be numbers of kept and of replaced steps, at least 1, got {self.blocks}")
 
-    def at(self, level: float) -> ScheduledSampling:
+    def at(self, level: float | Tensor) -> ScheduledSampling:
         """Return a copy with this probability, for schedules.
 
         Args:
             level: probability, from 0 to 1.
         """
         return replace(self, probability=level)
+
+    @property
+    def active(self) -> bool:
+        """Whether any frame may be replaced."""
+        return isinstance(self.probability, Tensor) or self.probability > 0
 
     def frames(self, batch: int, length: int, device: torch.device) -> Tensor:
         """Draw a mask (B, T, 1), True at frames that the model's own means replace, for B sequences of T frames.
@@ -103,7 +110,7 @@ class ScheduledSampling:
         Args:
             length: T, number of frames.
         """
-        if self.probability < 1:
+        if isinstance(self.probability, Tensor) or self.probability < 1:
             return None
         n_kept, n_replaced = self.blocks or (0, 1)
         return [t < self.start or (t - self.start) % (n_kept + n_replaced) < n_kept for t in range(length)]
@@ -116,7 +123,8 @@ class InputNoise:
     The scored data have no noise. Source: Fragkiadaki et al., 2015, arXiv 1508.00271.
 
     Args:
-        scale: standard deviation, in the unit of the networks' inputs (`dvae.data.units`).
+        scale: standard deviation, in the unit of the networks' inputs (`dvae.data.units`); within a CUDA graph, a
+            scalar tensor.
 
     Raises:
         ValueError: `scale` is negative or not finite.
@@ -126,19 +134,24 @@ class InputNoise:
         >>> terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2), scheduled_sampling=dvae.InputNoise(0.5))
     """
 
-    scale: float
+    scale: float | Tensor
 
     def __post_init__(self) -> None:
-        if not 0 <= self.scale < inf:
+        if not isinstance(self.scale, Tensor) and not 0 <= self.scale < inf:
             raise ValueError(f"the scale of noise must be finite and at least 0, got {self.scale}")
 
-    def at(self, level: float) -> InputNoise:
+    def at(self, level: float | Tensor) -> InputNoise:
         """Return a copy with this share of the scale, for schedules.
 
         Args:
             level: share of the scale.
         """
         return InputNoise(level * self.scale)
+
+    @property
+    def active(self) -> bool:
+        """Whether there is noise."""
+        return isinstance(self.scale, Tensor) or self.scale > 0
 
 
 @dataclass(frozen=True)
@@ -393,7 +406,7 @@ class Rollout:
     @property
     def noisy(self) -> Collection[str]:
         """Names of the data variables with noise on their history."""
-        return () if not isinstance(self.feeding, InputNoise) or not self.feeding.scale else self.data
+        return () if not isinstance(self.feeding, InputNoise) or not self.feeding.active else self.data
 
     def history(self, name: str) -> dict[str, Tensor]:
         """Return replacements for data that a variable may not read: the model's own means, or noisy data.
@@ -412,7 +425,7 @@ class Rollout:
     def _replacements(self) -> dict[str, Tensor]:
         """Dictionary from data variable to noisy data (B, T, D); `history` adds the model's means block by block."""
         noisy: dict[str, Tensor] = {}
-        if not isinstance(self.feeding, InputNoise) or not self.feeding.scale:
+        if not isinstance(self.feeding, InputNoise) or not self.feeding.active:
             return noisy
         for name in self.factorization.variables:  # a fixed order for the random draws
             if name in self.data and name in self.values and self.factorization.local(name):
@@ -428,9 +441,10 @@ class Rollout:
     @cached_property
     def hidden(self) -> dict[str, Hidden]:
         """Data entries that the model may not read: missing ones, and frames that scheduled sampling replaces."""
-        missing = {name: ~mask for name, mask in self.observed.items() if name in self.values and not mask.all()}
+        masks = {name: mask for name, mask in self.observed.items() if name in self.values}
+        missing = {name: ~mask for name, mask in masks.items() if is_deferring() or not mask.all()}
         hidden = {name: Hidden(entries) for name, entries in missing.items()}
-        if not isinstance(self.feeding, ScheduledSampling) or not self.feeding.probability:
+        if not isinstance(self.feeding, ScheduledSampling) or not self.feeding.active:
             return hidden
         replaced = self.feeding.frames(self.batch, self.length, next(iter(self.values.values())).device)
         for name in self.data & self.values.keys():
@@ -449,7 +463,7 @@ class Rollout:
         if not names:
             return {}
         feeding = self.feeding
-        if not isinstance(feeding, ScheduledSampling) or feeding.passes is None or not feeding.probability:
+        if not isinstance(feeding, ScheduledSampling) or feeding.passes is None or not feeding.active:
             return self._run(block, self._replacements, self.hidden)
         values = {**self.known, **self._replacements}
         for _ in range(feeding.passes):
@@ -578,7 +592,9 @@ class Rollout:
                 is_known = [a and b for a, b in zip(is_known, fixed, strict=False)]
             elif (mask := self.observed.get(name) if hidden is None else ~hidden[name].entries) is not None:
                 masks.append(mask[:, :end].all(-1).all(0))
-        if masks:
+        if masks and is_deferring():  # computes all steps, and `fill` keeps the known values
+            is_known = [False] * end
+        elif masks:
             is_known = [a and b for a, b in zip(is_known, torch.stack(masks).all(0).tolist(), strict=True)]
         return is_known + [False] * (self.length - end)
 

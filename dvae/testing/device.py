@@ -5,6 +5,10 @@ they also have no gradients. Here a tensor on the device wraps a tensor on the C
 operation that mixes the two devices raises an error, as in CUDA. Each copy between the devices is listed, and so is
 each value on which the program synchronises.
 
+CUDA graphs are simulated too: `torch.cuda.graph` records the operations on the device, and a read or an upload is an
+error in it. A replay runs the same operations on the same tensors, so everything that Python decided in the recording
+stays as it was, as on a GPU.
+
 A real GPU draws other random numbers than the CPU. Under `SameNoise` it uses the random numbers of the CPU, so results
 agree.
 """
@@ -12,8 +16,10 @@ agree.
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 from unittest import mock
@@ -78,6 +84,8 @@ class Traffic(TorchDispatchMode):
     Attributes:
         reads: copies to the CPU, and synchronisations: values, and shapes and errors that depend on values.
         uploads: copies to the device.
+        tape: graph that records the operations, or None.
+        sync_debug_mode: "warn" to warn of reads and uploads, as torch does on a GPU.
     """
 
     def __init__(self) -> None:
@@ -85,6 +93,22 @@ class Traffic(TorchDispatchMode):
         self.reads: list[str] = []
         self.uploads: list[str] = []
         self.within = False
+        self.tape: Tape | None = None
+        self.sync_debug_mode: Any = "default"
+
+    def note(self, transfers: list[str], operation: Any) -> None:
+        """Add a transfer to a list; warn of it in debug mode, and raise an error while a graph is recorded."""
+        origin = _origin(operation)
+        transfers.append(origin)
+        if self.tape is not None:
+            raise RuntimeError(f"operation not permitted when stream is capturing: {origin}")
+        if self.sync_debug_mode == "warn":
+            path, _, line = origin.partition(" ")[0].rpartition(":")
+            warnings.warn_explicit("called a synchronizing CUDA operation", UserWarning, path, int(line))
+
+    def set_sync_debug_mode(self, mode: Any) -> None:
+        """Replace `torch.cuda.set_sync_debug_mode`."""
+        self.sync_debug_mode = mode
 
     def clear(self) -> None:
         """Clear both lists."""
@@ -102,23 +126,23 @@ class Traffic(TorchDispatchMode):
         if is_requested:
             kwargs["device"] = torch.device("cpu")
             if tensors and not device_tensors:
-                self.uploads.append(_origin(packet))
+                self.note(self.uploads, packet)
                 cpu_tensors = []
         elif device_tensors and packet is aten.copy_:
             target, source = (isinstance(value, OnDevice) for value in args[:2])
             if target != source:
-                (self.uploads if target else self.reads).append(_origin(packet))
+                self.note(self.uploads if target else self.reads, packet)
             cpu_tensors = []
         elif device_tensors and packet in INDEXED:
             indices = [index for index in args[1] if index is not None]
             fill = len(args) > 2 and args[2].numel() == 1  # filling under a mask needs no indices
             if any(index.dtype == torch.bool for index in indices) and not fill:
-                self.reads.append(_origin(packet))
+                self.note(self.reads, packet)
             if cpu_indices := [index for index in indices if not isinstance(index, OnDevice)]:
-                self.uploads.append(_origin(packet))
+                self.note(self.uploads, packet)
                 cpu_tensors = [value for value in cpu_tensors if all(value is not index for index in cpu_indices)]
         elif device_tensors and packet in READS:
-            self.reads.append(_origin(packet))
+            self.note(self.reads, packet)
         # tensors that torch creates in a function of device tensors are on the device too
         is_within = self.within and not tensors and device is not None
         if not (device_tensors or is_requested or is_within):
@@ -129,13 +153,59 @@ class Traffic(TorchDispatchMode):
                 f"{packet} of tensors on {OnDevice.device} and on the CPU {shapes}; move them to one device"
             )
         cpu_args = [_map_tensors(value, OnDevice, lambda v: v.own) for value in (*args, *kwargs.values())]
-        result = func(*cpu_args[: len(args)], **dict(zip(kwargs, cpu_args[len(args) :], strict=True)))
+        run = func if self.tape is None else partial(self.tape.record, func)
+        result = run(*cpu_args[: len(args)], **dict(zip(kwargs, cpu_args[len(args) :], strict=True)))
         if torch.Tag.inplace_view in func.tags:  # the wrapper stores its own shape
             with no_dispatch():
                 func(*args, **kwargs)
         return _map_tensors(
             result, Tensor, lambda value: device_tensors[id(value)] if id(value) in device_tensors else OnDevice(value)
         )
+
+
+class Tape:
+    """A simulated `torch.cuda.CUDAGraph`."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, Any, Any, bool, list[Tensor]]] = []
+        self._own: set[int] = set()  # storages that the recording allocates
+        self._changed: dict[int, tuple[Tensor, Tensor]] = {}  # other storages that it writes to, and their values
+
+    def record(self, func: Any, *args: Any, **kwargs: Any) -> Any:
+        """Run an operation and record it."""
+        given = dict(zip([argument.name for argument in func._schema.arguments], args, strict=False)) | kwargs
+        for argument in func._schema.arguments:
+            is_running = argument.name.startswith("running_")  # batch norms write to it without saying so
+            if is_running or (argument.alias_info is not None and argument.alias_info.is_write):
+                for storage in map(Tensor.untyped_storage, _tensors([given.get(argument.name)])):
+                    if storage.data_ptr() not in self._own | self._changed.keys():
+                        whole = torch.empty(0, dtype=torch.uint8).set_(storage)  # type: ignore[call-overload]
+                        self._changed[storage.data_ptr()] = whole, whole.clone()
+        before = {tensor.untyped_storage().data_ptr() for tensor in _tensors([*args, *kwargs.values()])}
+        # aliases, since an operation such as `t_` changes the shape of a tensor
+        aliases = [_map_tensors(value, Tensor, Tensor.detach) for value in (*args, *kwargs.values())]
+        call = func, aliases[: len(args)], dict(zip(kwargs, aliases[len(args) :], strict=True))
+        result = func(*args, **kwargs)
+        results = list(_tensors([result]))
+        new = {tensor.untyped_storage().data_ptr() for tensor in results} - before
+        self._own |= new
+        if new or not results or (func._schema.is_mutable and torch.Tag.inplace_view not in func.tags):
+            self.calls.append((*call, torch.is_grad_enabled(), [tensor.detach() for tensor in results]))
+        return result
+
+    def end(self, random_state: Tensor) -> None:
+        """Undo the changes of a recording, in which a GPU computes nothing."""
+        torch.set_rng_state(random_state)
+        for whole, values in self._changed.values():
+            whole.copy_(values)
+
+    def replay(self) -> None:
+        """Run the recorded operations again, with results in the recorded tensors."""
+        for func, args, kwargs, is_training, recorded in self.calls:
+            with no_dispatch(), torch.set_grad_enabled(is_training):  # oneDNN has other kernels in training
+                for before, now in zip(recorded, _tensors([func(*args, **kwargs)]), strict=True):
+                    if now.data_ptr() != before.data_ptr():
+                        before.copy_(now)
 
 
 class _Moves(TorchFunctionMode):
@@ -153,7 +223,7 @@ class _Moves(TorchFunctionMode):
         if func in (Tensor.numpy, Tensor.__array__, Tensor.tolist) and isinstance(args[0], OnDevice):
             if func is not Tensor.tolist:
                 raise TypeError(f"a tensor on {OnDevice.device} cannot become an array; move it to the CPU first")
-            self.traffic.reads.append(_origin("tolist"))
+            self.traffic.note(self.traffic.reads, "tolist")
             return args[0].own.tolist()
         before, self.traffic.within = self.traffic.within, any(isinstance(value, OnDevice) for value in _tensors(args))
         try:
@@ -161,7 +231,7 @@ class _Moves(TorchFunctionMode):
         finally:
             self.traffic.within = before
         if func is Tensor.new_tensor and isinstance(args[0], OnDevice) and not isinstance(result, OnDevice):
-            self.traffic.uploads.append(_origin("new_tensor"))
+            self.traffic.note(self.traffic.uploads, "new_tensor")
             return OnDevice(result.detach(), result.requires_grad)
         return result
 
@@ -174,9 +244,9 @@ class _Moves(TorchFunctionMode):
         if is_on_device == isinstance(value, OnDevice):
             return cast
         if is_on_device:
-            self.traffic.uploads.append(_origin("to"))
+            self.traffic.note(self.traffic.uploads, "to")
             return OnDevice(cast.detach(), value.requires_grad)
-        self.traffic.reads.append(_origin("to"))
+        self.traffic.note(self.traffic.reads, "to")
         return cast.own  # type: ignore[attr-defined, no-any-return]
 
 
@@ -221,10 +291,41 @@ def on_device() -> Iterator[Traffic]:
     lifting = torch._C._only_lift_cpu_tensors()
     with ExitStack() as stack:
         for name in ("_lazy_init", "get_rng_state", "set_rng_state"):  # all draws use the random state of the CPU
-            stack.enter_context(mock.patch.object(torch.cuda, name, return_value=torch.empty(0)))
+            stack.enter_context(mock.patch.object(torch.cuda, name, return_value=torch.empty(0, dtype=torch.uint8)))
         torch._C._set_only_lift_cpu_tensors(True)  # so that torch.tensor(..., device=...) moves them with `to`
         stack.callback(torch._C._set_only_lift_cpu_tensors, lifting)
         traffic = stack.enter_context(Traffic())
+
+        @contextmanager
+        def graph(tape: Tape, **_: Any) -> Iterator[None]:
+            traffic.tape, random_state = tape, torch.get_rng_state()
+            try:
+                yield
+            finally:
+                traffic.tape = None
+                with no_dispatch():
+                    tape.end(random_state)
+
+        stream = mock.MagicMock()
+        replacements = {
+            "CUDAGraph": Tape,
+            "Stream": stream,
+            "stream": stream,
+            "current_stream": stream,
+            "graph": graph,
+            "set_sync_debug_mode": traffic.set_sync_debug_mode,
+            "get_sync_debug_mode": lambda: traffic.sync_debug_mode,
+        }
+        for name, replacement in replacements.items():
+            stack.enter_context(mock.patch.object(torch.cuda, name, replacement))
+        by_device = torch.optim.Optimizer._group_tensors_by_device_and_dtype
+
+        def group(lists: Any, with_indices: bool = False) -> Any:  # torch's reads the device of the CPU tensor
+            groups = by_device(lists, with_indices)
+            is_on_device = isinstance(lists[0][0], OnDevice)
+            return {(OnDevice.device if is_on_device else d, dtype): v for (d, dtype), v in groups.items()}
+
+        stack.enter_context(mock.patch.object(torch.optim.Optimizer, by_device.__name__, staticmethod(group)))
         stack.enter_context(_Moves(traffic))
         yield traffic
 

@@ -21,6 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...capture import Captured, any_failed, deferring
+from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, axis_names
 from ...options import Count, Delay, require
 from ...program.model import DynamicalVAE
@@ -52,6 +54,7 @@ def evaluate(
     configs: Mapping[str, Mapping[str, Any]] | None = None,
     options: Mapping[str, Any] | None = None,
     progress: bool = True,
+    cuda_graph: bool = False,
 ) -> Evaluation:
     """Score one or several models, and the reference rows, on the same windows.
 
@@ -80,6 +83,8 @@ def evaluate(
         options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at the mean of the
             prior.
         progress: whether to show a progress bar.
+        cuda_graph: on a CUDA GPU, whether to replay forecasts as CUDA graphs (`dvae.capture`). It has only been tested
+            on a simulated GPU.
 
     Returns:
         The evaluation; print it, or use its `table`, `plot` and `to_json`.
@@ -122,9 +127,8 @@ def evaluate(
             rows[name] = Row(count, cluster_scores, histograms=histograms)
         for name, each in models.items():
             with seeded_evaluation(each, seed):
-                forecaster = forecaster_of(
-                    each, eval_windows, samples, {"draw_emission": is_drawn[name], **(options or {})}
-                )
+                forecast_options = {"draw_emission": is_drawn[name], **(options or {})}
+                forecaster = forecaster_of(each, eval_windows, samples, forecast_options, cuda_graph)
                 cluster_scores, histograms = evaluator.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with seeded_evaluation(each, seed):
@@ -306,7 +310,9 @@ def _references(
     return truths | {name: available[name] for name in requested}
 
 
-def forecaster_of(model: Any, windows: EvaluationWindows, samples: int, options: Mapping[str, Any]) -> Forecaster:
+def forecaster_of(
+    model: Any, windows: EvaluationWindows, samples: int, options: Mapping[str, Any], cuda_graph: bool = False
+) -> Forecaster:
     """Return a function that forecasts futures (K, B, H, D) of a slice of windows.
 
     Args:
@@ -314,9 +320,28 @@ def forecaster_of(model: Any, windows: EvaluationWindows, samples: int, options:
         windows: windows to forecast.
         samples: K, number of futures per window.
         options: further arguments of the model's `forecast`.
+        cuda_graph: on a CUDA GPU, whether to replay forecasts as CUDA graphs.
     """
-    horizon = windows.futures.shape[1]
-    return lambda part: model.forecast(on_device_of(model, windows.past(part)), horizon, samples, **options)["x"]
+    horizon, device = windows.futures.shape[1], next(model.parameters()).device
+
+    def forecast(part: slice) -> Tensor:
+        futures: Tensor = model.forecast(on_device_of(model, windows.past(part)), horizon, samples, **options)["x"]
+        return futures
+
+    def record(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        with deferring() as checks:
+            futures = model.forecast(Batch.from_leaves(inputs), horizon, samples, **options)["x"]
+        return {"x": futures, "failed": any_failed(checks, device)}
+
+    if not cuda_graph or device.type != "cuda":
+        return forecast
+    captured = Captured(record, "a forecast", device)
+
+    def replay(part: slice) -> Tensor:
+        results = captured(None, on_device_of(model, windows.past(part)).leaves())
+        return forecast(part) if results["failed"] else results["x"]  # raises the error of the failed check
+
+    return replay
 
 
 def forecasts_of(name: str, forecaster: Forecaster, samples: int, windows: EvaluationWindows, part: slice) -> Tensor:

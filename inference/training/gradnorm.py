@@ -83,16 +83,19 @@ class GradNorm:
         return self.others.select
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
-        """Return the loss with all weights 1, a scalar."""
-        return self.weighted(terms, step, torch.ones(len(self.tasks)))
+        """Return the loss with all weights of tasks 1, a scalar."""
+        return self.loss(terms, self.weights(step))
 
-    def weighted(self, terms: "Terms", step: int, weights: Tensor) -> Tensor:
-        """Return the loss with the given weights (tasks,), a scalar.
+    def weights(self, step: int) -> dict[str, float]:
+        """Return the weights of `others` at a global step, and 1 for each task, as "task/NAME"."""
+        return self.others.weights(step) | {f"task/{task}": 1.0 for task in self.tasks}
+
+    def loss(self, terms: "Terms", weights: Mapping[str, Any]) -> Tensor:
+        """Return the loss, a scalar.
 
         Args:
             terms: terms of the bound.
-            step: global step, for schedules of `others`.
-            weights: weights (tasks,), in the order of `tasks`.
+            weights: weights as in `weights`, as numbers or scalar tensors.
 
         Raises:
             ValueError: the model has no log-likelihood or energy with the name of a task.
@@ -101,9 +104,9 @@ class GradNorm:
             {name: value for name, value in table.items() if name not in self.tasks}
             for table in (terms.log_likelihood, terms.energies)
         ]
-        loss = self.others(replace(terms, log_likelihood=other_terms[0], energies=other_terms[1]), step)
-        for weight, task in zip(weights.tolist(), self.losses(terms), strict=True):
-            loss = loss + weight * task
+        loss = self.others.loss(replace(terms, log_likelihood=other_terms[0], energies=other_terms[1]), weights)
+        for task, value in zip(self.tasks, self.losses(terms), strict=True):
+            loss = loss + weights[f"task/{task}"] * value
         return loss
 
     def losses(self, terms: "Terms") -> list[Tensor]:
@@ -158,29 +161,40 @@ class Balance:
     def __init__(self, objective: GradNorm, shared: list[nn.Parameter]) -> None:
         self.objective = objective
         self.shared = shared
-        self.weights = torch.ones(len(objective.tasks), dtype=torch.float64)
-        self.first = torch.zeros_like(self.weights)  # L_i(0), zeros before the first step
+        self.task_weights = torch.ones(len(objective.tasks), dtype=torch.float64)
+        self.first = torch.zeros_like(self.task_weights)  # L_i(0), zeros before the first step
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
         """Return the loss, a scalar."""
-        return self.objective.weighted(terms, step, self.weights)
+        return self.loss(terms, self.weights(step))
 
-    def measure(self, terms: "Terms") -> None:
-        """Store the losses of the tasks for a batch, and their gradients with respect to W."""
+    def weights(self, step: int) -> dict[str, float]:
+        """Return the weights of `GradNorm.weights` at a global step, with the present weights of the tasks."""
+        present = zip(self.objective.tasks, self.task_weights.tolist(), strict=True)
+        return self.objective.weights(step) | {f"task/{task}": weight for task, weight in present}
+
+    def loss(self, terms: "Terms", weights: Mapping[str, Any]) -> Tensor:
+        """Return the loss at given weights, as `GradNorm.loss` does."""
+        return self.objective.loss(terms, weights)
+
+    def measure(self, terms: "Terms") -> dict[str, Tensor]:
+        """Return the losses (tasks,) of a batch, and their gradients (tasks, W) with respect to W."""
         losses = self.objective.losses(terms)
-        self._losses = torch.stack([loss.detach() for loss in losses])
-        self._gradients = torch.stack(
-            [self._gradient(*each) for each in zip(self.objective.tasks, losses, strict=True)]
-        )
+        gradients = [self._gradient(*each) for each in zip(self.objective.tasks, losses, strict=True)]
+        return {"losses": torch.stack([loss.detach() for loss in losses]), "gradients": torch.stack(gradients)}
 
-    def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
+    def adapt(self, measured: Mapping[str, Tensor], mean: Callable[[Tensor], Tensor]) -> None:
         """Update the weights, for the loss of the next step.
+
+        Args:
+            measured: result of `measure`.
+            mean: function that averages a tensor over the processes.
 
         Raises:
             ValueError: when the training rate of a loss is not defined, because the loss is not positive.
         """
-        norms = torch.linalg.vector_norm(mean(self._gradients), dim=1, dtype=torch.float64)
-        losses, norms = torch.stack([mean(self._losses).double(), norms]).cpu()  # one copy, one synchronisation
+        norms = torch.linalg.vector_norm(mean(measured["gradients"]), dim=1, dtype=torch.float64)
+        losses, norms = torch.stack([mean(measured["losses"]).double(), norms]).cpu()  # one synchronisation
         first, asymmetry = self.first if self.first.any() else losses, self.objective.asymmetry
         for task, start, now in zip(self.objective.tasks, first.tolist(), losses.tolist(), strict=True):
             if asymmetry and (start <= 0 or now < 0):
@@ -191,23 +205,22 @@ class Balance:
         self.first = first
         smallest = torch.finfo(torch.float64).tiny  # if all losses or all gradients are 0
         ratios = losses / first if asymmetry else torch.ones_like(losses)
-        norms = self.weights * norms
+        norms = self.task_weights * norms
         target = norms.mean() * (ratios / ratios.mean().clamp(min=smallest)) ** asymmetry
         move = torch.sign(norms - target) * norms / norms.mean().clamp(min=smallest)
-        logarithms = self.weights.log() - self.objective.learning_rate * move
-        self.weights = torch.softmax(logarithms, 0) * len(logarithms)
+        logarithms = self.task_weights.log() - self.objective.learning_rate * move
+        self.task_weights = torch.softmax(logarithms, 0) * len(logarithms)
 
     @property
     def row(self) -> dict[str, float]:
         """Weights by name, for the log."""
-        return {
-            f"weight/{task}": weight for task, weight in zip(self.objective.tasks, self.weights.tolist(), strict=True)
-        }
+        present = zip(self.objective.tasks, self.task_weights.tolist(), strict=True)
+        return {f"weight/{task}": weight for task, weight in present}
 
     @property
     def state(self) -> dict[str, Tensor]:
         """Weights, and the losses of the first step."""
-        values = {"weight": self.weights, "first": self.first}
+        values = {"weight": self.task_weights, "first": self.first}
         return {
             f"{name}/{task}": value[i] for name, value in values.items() for i, task in enumerate(self.objective.tasks)
         }
@@ -222,7 +235,7 @@ class Balance:
         weights, first = (torch.stack([state[f"{name}/{task}"] for task in tasks]) for name in ("weight", "first"))
         if not (weights > 0).all() or abs(weights.sum() - len(tasks)) > 1e-6:
             raise ValueError(f"the weights of {', '.join(tasks)} must be positive numbers with the sum {len(tasks)}")
-        self.weights, self.first = weights, first
+        self.task_weights, self.first = weights, first
 
     def _gradient(self, task: str, loss: Tensor) -> Tensor:
         """Return the flat gradient of a task's loss with respect to W; zeros if the loss of this batch is constant."""

@@ -43,6 +43,17 @@ class RequiresDraws(Protocol):
 
 
 @runtime_checkable
+class WeightedObjective(Objective, Protocol):
+    """Objective whose loss depends on the step only through numbers, which a CUDA graph receives as tensors."""
+
+    def weights(self, step: int) -> Mapping[str, float]:
+        """Return the weights at a global step, by name; their names do not depend on the step."""
+
+    def loss(self, terms: "Terms", weights: Mapping[str, Any]) -> Tensor:
+        """Return the loss at given weights, numbers or scalar tensors."""
+
+
+@runtime_checkable
 class StatefulObjective(Objective, Protocol):
     """Objective with a state within a stage of a run, such as `gradnorm.Balance`.
 
@@ -57,13 +68,14 @@ class StatefulObjective(Objective, Protocol):
     def row(self) -> Mapping[str, float]:
         """Current values for the log, by name."""
 
-    def measure(self, terms: "Terms") -> None:
-        """Compute gradients of a batch before the backward pass; the graph must be retained."""
+    def measure(self, terms: "Terms") -> Mapping[str, Tensor]:
+        """Return quantities of a batch by name, before the backward pass; the autograd graph must be retained."""
 
-    def adapt(self, mean: Callable[[Tensor], Tensor]) -> None:
-        """Update the state after the backward pass and its checks, and before the optimiser's step.
+    def adapt(self, measured: Mapping[str, Tensor], mean: Callable[[Tensor], Tensor]) -> None:
+        """Update the state after the backward pass and its checks.
 
         Args:
+            measured: result of `measure`.
             mean: function that averages a tensor over the processes; every process must call it.
         """
 
@@ -121,9 +133,27 @@ class Evidence:
 
     def __call__(self, terms: "Terms", step: int) -> Tensor:
         """Return the loss, a scalar."""
-        kl_weight = _by_name("kl_weight", self.kl_weight, terms.kl, default=1.0)
+        return self.loss(terms, self.weights(step))
+
+    def weights(self, step: int) -> dict[str, float]:
+        """Return the scheduled weights at a global step, as "kl_weight" for all latents or "kl_weight/z" for one."""
+        values: dict[str, float] = {}
+        for option in ("kl_weight", "energy_weights"):
+            given = getattr(self, option)
+            by_name = given.items() if isinstance(given, Mapping) else [("", given)]
+            values |= {f"{option}/{name}".rstrip("/"): schedule(weight)(step) for name, weight in by_name}
+        return values
+
+    def loss(self, terms: "Terms", weights: Mapping[str, Any]) -> Tensor:
+        """Return the loss, a scalar.
+
+        Args:
+            terms: terms of the bound.
+            weights: result of `weights`, as numbers or scalar tensors.
+        """
+        for option, names in (("kl_weight", terms.kl), ("energy_weights", terms.energies)):
+            _by_name(option, getattr(self, option), names, default=1.0)
         free_bits = _by_name("free_bits", self.free_bits, terms.kl, default=0.0)
-        energy_weights = _by_name("energy_weights", self.energy_weights, terms.energies, default=1.0)
         frames = terms.n_steps.sum()
         likelihood = sum((value.sum() for value in terms.log_likelihood.values()), frames.new_zeros(()))
         loss = -self.likelihood_weight * likelihood / frames
@@ -131,9 +161,9 @@ class Evidence:
             rate = kl.sum() / frames
             if free_bits[latent] > 0:  # without free bits no clamp: an unbiased estimate of a KL may be negative
                 rate = rate.clamp(min=free_bits[latent])
-            loss = loss + schedule(kl_weight[latent])(step) * rate
+            loss = loss + weights.get(f"kl_weight/{latent}", weights.get("kl_weight", 1.0)) * rate
         for name, energy in terms.energies.items():
-            loss = loss + schedule(energy_weights[name])(step) * energy.sum() / frames
+            loss = loss + weights.get(f"energy_weights/{name}", 1.0) * energy.sum() / frames
         return loss
 
     def to_config(self) -> dict[str, Any]:

@@ -39,6 +39,8 @@ class Training:
         devices: number of devices, with one process each; under torchrun, the number of processes on this host.
         precision: precision of the computation; "32-true" keeps the model's own.
         progress: whether to show a progress bar with the terms of the bound on the terminal.
+        cuda_graph: on a CUDA GPU, whether to replay steps as CUDA graphs (`dvae.capture`), one for each shape of batch;
+            not with several devices. It has only been tested on a simulated GPU.
 
     Raises:
         ValueError: when an option is out of range.
@@ -66,6 +68,7 @@ class Training:
     devices: Annotated[int, Range(1, 32)] = 1
     precision: Literal["32-true", "64-true", "bf16-mixed", "bf16-true"] = "32-true"
     progress: bool = True
+    cuda_graph: bool = False
 
     def __post_init__(self) -> None:
         if self.gradient_clip == math.inf:

@@ -7,6 +7,7 @@ caller's: draws of one do not affect the other.
 """
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from ...capture import Captured, any_failed, deferring
 from ...data.batch import Batch
 from ...data.sequences import Batched, as_batches, refuse_table, tensor_of
 from ...locking import no_fork, seeded, serialized
@@ -28,7 +30,7 @@ from ..bounds.elbo import SequenceELBO, Terms
 from ..evaluation.result import error_message
 from . import processes
 from .checkpoints import weights
-from .objectives import AdaptiveObjective, Objective, RequiresDraws, StatefulObjective
+from .objectives import AdaptiveObjective, Objective, RequiresDraws, StatefulObjective, WeightedObjective
 from .options import Stage, plan_stages, stage_at
 from .schedules import schedule
 
@@ -37,6 +39,10 @@ if TYPE_CHECKING:
 
 # only optimisers with a fused implementation
 OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD}
+
+
+_TABLES = "log_likelihood", "kl", "energies", "steps"
+"""Tables of tensors in `Terms`."""
 
 
 class NonFiniteError(FloatingPointError):
@@ -176,7 +182,25 @@ class SVI:
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             self.random = self._random_state()
         self._state, self._stage_objective = State(self.model), {}
+        self.captured = self._capture()
+        self._recorded: tuple[Stage, dict[str, float], list[str]] | None = None
         return self._state
+
+    def _capture(self) -> Captured | None:
+        """Return the step as a function for CUDA graphs; None without the option, or if something prevents them."""
+        if not self.training.cuda_graph:
+            return None
+        kind = self.fabric.device.type
+        obstacles = [] if kind == "cuda" else [f"the device is a {kind}"]
+        obstacles += ["processes exchange their gradients"] if self.fabric.world_size > 1 else []
+        for objective in {id(stage.objective): stage.objective for stage in self.plan}.values():
+            if not isinstance(objective, WeightedObjective):
+                name = getattr(objective, "__name__", type(objective).__name__)
+                obstacles.append(f"{name} has no weights as `WeightedObjective` does")
+        if obstacles:
+            warnings.warn(f"the training step runs without a CUDA graph: {'; '.join(obstacles)}", stacklevel=3)
+            return None
+        return Captured(self._record, "the training step", self.fabric.device)
 
     @serialized
     @torch.inference_mode(False)
@@ -192,45 +216,147 @@ class SVI:
         Raises:
             NonFiniteError: when the loss or a gradient is NaN or infinite; the weights do not change.
         """
-        state, training = self.state, self.training
-        (_, stage), rates, objective = stage_at(self.plan, state.step), self.rates(state.step), self.objective
-        for group in self.optimizer.param_groups:
-            group["lr"] = rates["learning_rate"]
+        state, rates = self.state, self.rates(self.state.step)
+        stage = stage_at(self.plan, state.step)[1]
         if not self.model.training:
             self.module.train()
-        location = f"step {state.step + 1}"
+        converted = self._convert(batch)
+        take = self._step if self.captured is None else self._replay
+        state.terms = take(converted, stage, rates)
+        state.step += 1
+        return state.terms
+
+    def _step(self, batch: Batch, stage: Stage, rates: Mapping[str, float]) -> Terms:
+        """Take a step, and return the terms before it."""
+        objective, training, step = self.objective, self.training, self.state.step
         with self.drawing():
-            terms = self._terms(batch, stage.objective, location, rates["scheduled_sampling"], rates.get("curriculum"))
-            loss = objective(terms, state.step)
-            self.optimizer.zero_grad()
-            self.fabric.backward(loss)
+            terms, measured = self._terms(
+                batch, stage.objective, f"step {step + 1}", rates["scheduled_sampling"], rates.get("curriculum")
+            )
+            gradients, numbers = self._differentiate(objective(terms, step), terms, stage)
+        # The only synchronisation with the device in a step; all other work is queued.
+        self._verdict(numbers.tolist(), terms)
+        if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
+            for gradient in gradients:
+                gradient.mul_(training.gradient_clip / numbers[1])
+        self._adapt(measured)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rates["learning_rate"]
+        self.optimizer.step()
+        return terms
+
+    def _adapt(self, measured: Mapping[str, Tensor]) -> None:
+        """Store the weights of a stateful objective for the log, and update its state."""
+        self._weights = dict[str, float]()
+        if isinstance(self.objective, StatefulObjective):
+            self._weights |= self.objective.row
+            self.objective.adapt(measured, self.mean)
+
+    def _differentiate(self, loss: Tensor, terms: Terms, stage: Stage) -> tuple[list[Tensor], Tensor]:
+        """Compute the gradients of the loss, averaged over the processes.
+
+        Returns:
+            Gradients of the parameters that are trained in the stage, and (3,) loss, norm of the gradient, and a number
+            that is finite if both are in all processes.
+        """
+        self.optimizer.zero_grad()
+        self.fabric.backward(loss)
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # the optimiser skips a parameter without a gradient, and keeps its state
         total_loss, self._share = processes.average_gradients(self.fabric, self.parameters, loss, terms.n_steps.sum())
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
-        # The only synchronisation with the device in a step; all other work is queued.
-        *self._numbers, of_all = torch.stack([loss.detach(), norm, total_loss + norm]).tolist()
-        if not math.isfinite(of_all):
-            impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
-            advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
-            if impossible and not state.step:
-                advice = "a distribution whose support includes these values; the support may depend on its parameters"
-            raise NonFiniteError(
-                f"{location}: {_describe_non_finite(self.model, terms, loss)}; no step was taken. Try {advice}"
-            )
-        if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
-            for gradient in gradients:
-                gradient.mul_(training.gradient_clip / norm)
-        self._weights = dict[str, float]()
-        if isinstance(objective, StatefulObjective):
-            self._weights |= objective.row
-            objective.adapt(self.mean)
-        self.optimizer.step()
-        state.step += 1
-        state.terms = terms
+        return gradients, torch.stack([loss.detach(), norm, total_loss + norm])
+
+    def _verdict(self, numbers: list[float], terms: Terms) -> None:
+        """Store loss and norm of the gradient, and raise `NonFiniteError` if the loss or a gradient is not finite."""
+        *self._numbers, of_all = numbers
+        if math.isfinite(of_all):
+            return
+        step = self.state.step
+        impossible = any((value == -math.inf).any() for value in terms.log_likelihood.values())
+        advice = "a lower learning rate, a smaller gradient_clip or a longer warm-up"
+        if impossible and not step:
+            advice = "a distribution whose support includes these values; the support may depend on its parameters"
+        problem = _describe_non_finite(self.model, terms, self._numbers[0])
+        raise NonFiniteError(f"step {step + 1}: {problem}; no step was taken. Try {advice}")
+
+    def _replay(self, batch: Batch, stage: Stage, rates: Mapping[str, float]) -> Terms:
+        """Take a step as `_step` does, by a CUDA graph if there is one for this kind of batch and stage."""
+        assert self.captured is not None
+        assert isinstance(self.objective, WeightedObjective)
+        weights = self.objective.weights(self.state.step)
+        sampling, curriculum = rates["scheduled_sampling"], rates.get("curriculum")
+        constant = {"scheduled_sampling": sampling} if sampling in (0.0, 1.0) else {}
+        constant |= {} if curriculum is None else {"curriculum": curriculum}
+        self._recorded = stage, constant, list(weights)
+        numbers = [rates["learning_rate"], sampling, *weights.values()]
+        inputs = {"numbers": torch.tensor(numbers, dtype=torch.float64), **batch.leaves()}
+        with self.drawing():
+            kind = stage_at(self.plan, self.state.step)[0], *constant.items()
+            results = self.captured(kind, inputs)
+        *verdict, is_invalid = results["numbers"].tolist()
+        if is_invalid:  # the program itself raises the error of its check
+            self._terms(batch, stage.objective, f"step {self.state.step + 1}", sampling, curriculum)
+        parts: dict[str, dict[str, Tensor]] = {}
+        for path, value in results.items():
+            part, _, name = path.partition("/")
+            parts.setdefault(part, {})[name] = value
+        for name, parameter in self.model.named_parameters():
+            parameter.grad = parts["gradient"].get(name)
+        tables = {field: {name: value.clone() for name, value in parts.get(field, {}).items()} for field in _TABLES}
+        terms = Terms(**tables, n_steps=results["n_steps"].clone())
+        self._verdict(verdict, terms)
+        self._adapt(parts.get("measured", {}))
         return terms
+
+    def _record(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Take a step without reading a value of the GPU; a step whose loss or gradient is not finite changes nothing.
+
+        Args:
+            inputs: "numbers" (2 + W,): learning rate, probability of scheduled sampling and weights of the objective;
+                and the tensors of the batch by path.
+
+        Returns:
+            "numbers" (4,) as from `_differentiate`, and whether a check of the batch failed; terms, gradients and
+            measured quantities by path.
+        """
+        assert self._recorded is not None
+        assert isinstance(self.objective, WeightedObjective)
+        stage, constant, names = self._recorded
+        numbers, objective = inputs["numbers"], self.objective
+        sampling = constant.get("scheduled_sampling", numbers[1])
+        batch = Batch.from_leaves({path: value for path, value in inputs.items() if path != "numbers"})
+        with deferring() as checks:
+            terms, measured = self._terms(batch, stage.objective, "", sampling, constant.get("curriculum"))
+        weights = numbers[2:].to(terms.n_steps.dtype).unbind()
+        loss = objective.loss(terms, dict(zip(names, weights, strict=True)))
+        gradients, verdict = self._differentiate(loss, terms, stage)
+        is_invalid = any_failed(checks, verdict.device)
+        is_refused = is_invalid | ~torch.isfinite(verdict[2])
+        if self.training.gradient_clip is not None:
+            torch._foreach_mul_(gradients, (self.training.gradient_clip / verdict[1]).clamp(max=1))
+        optimizer = self.optimizer.optimizer
+        optimizer.found_inf = is_refused.float()
+        before = [dict(group) for group in optimizer.param_groups]
+        try:
+            for group in optimizer.param_groups:
+                group["lr"] = numbers[0].float()
+                if "capturable" in group:  # torch asks for it, although fused optimisers do not differ
+                    group["capturable"] = True
+            optimizer.step()
+        finally:
+            del optimizer.found_inf
+            for group, options in zip(optimizer.param_groups, before, strict=True):
+                group.update(options)
+        tables = {
+            f"{field}/{name}": value.detach() for field in _TABLES for name, value in getattr(terms, field).items()
+        }
+        gradient = {f"gradient/{n}": p.grad for n, p in self.model.named_parameters() if p.grad is not None}
+        extra = {f"measured/{name}": value for name, value in measured.items()}
+        verdict = torch.cat([verdict, is_invalid.to(verdict)[None]])
+        return {"numbers": verdict, "n_steps": terms.n_steps, **tables, **gradient, **extra}
 
     def row(self) -> dict[str, float]:
         """Return the numbers of the last step, in nats per step (see `trackers`).
@@ -375,7 +501,8 @@ class SVI:
             with self._drawing(random), torch.no_grad():  # other threads may run between two batches
                 if (batch := next(batches, None)) is None:
                     break
-                terms = self._terms(batch, objective, f"validation after step {self.state.step}", feeding)
+                location = f"validation after step {self.state.step}"
+                terms, _ = self._terms(self._convert(batch), objective, location, feeding)
                 sums_of_batch = _sums(terms)
                 if not terms.likelihood or (isinstance(objective, RequiresDraws) and objective.select == "loss"):
                     sums_of_batch["loss"] = objective(terms, last).double() * sums_of_batch["steps"]
@@ -384,31 +511,41 @@ class SVI:
         totals = self.total(torch.stack(list(sums.values())) * shares)
         return _per_step(dict(zip(sums, totals, strict=True)))
 
+    def _convert(self, batch: AnyBatch) -> Batch:
+        """Return a batch as tensors, in the precision of the model unless it is a `DynamicalVAE`, which converts."""
+        refuse_table(batch)
+        converted = Batch(batch if isinstance(batch, Mapping) else {"x": batch}).map(tensor_of)
+        if isinstance(self.model, DynamicalVAE):
+            return converted
+        dtype = self.parameters[0].dtype
+        return converted.map(lambda v: v.to(dtype) if v.is_floating_point() else v)
+
     def _terms(
-        self, batch: AnyBatch, objective: Objective, location: str, feeding: float, curriculum: float | None = None
-    ) -> Terms:
-        """Return the terms of a batch that the objective needs, computed on the device of the model.
+        self,
+        batch: Batch,
+        objective: Objective,
+        location: str,
+        feeding: float | Tensor,
+        curriculum: float | None = None,
+    ) -> tuple[Terms, Mapping[str, Tensor]]:
+        """Return the terms of a batch that the objective needs, and what it measures, on the device of the model.
 
         Args:
-            batch: x as a tensor (B, T, D), or a batch.
+            batch: result of `_convert`.
             objective: objective that determines the numbers of draws.
             location: place in the run, for errors, such as "step 3".
             feeding: probability of scheduled sampling.
             curriculum: progress of the curriculum, from 0 to 1; None for a model without one.
         """
-        refuse_table(batch)
-        converted = Batch(batch if isinstance(batch, Mapping) else {"x": batch}).map(tensor_of)
-        if not isinstance(self.model, DynamicalVAE):  # a DynamicalVAE converts to its own precision
-            dtype = self.parameters[0].dtype
-            converted = converted.map(lambda v: v.to(dtype) if v.is_floating_point() else v)
-        program: dict[str, Any] = {"scheduled_sampling": feeding} if feeding else {}
+        program: dict[str, Any] = {"scheduled_sampling": feeding} if isinstance(feeding, Tensor) or feeding else {}
         program |= {} if curriculum is None else {"curriculum": curriculum}
         if isinstance(objective, RequiresDraws) and objective.draws:
             program["draws"] = objective.draws
         try:
             measure = self.objective.measure if isinstance(self.objective, StatefulObjective) else None
-            on_device = self.fabric.to_device(converted)
-            return Terms(**self.module(lambda: on_device, program, measure))  # fabric rounds tensor arguments
+            on_device = self.fabric.to_device(batch)
+            terms, measured = self.module(lambda: on_device, program, measure)  # fabric rounds tensor arguments
+            return Terms(**terms), measured
         except ValueError as error:
             if not _is_from_distribution(error):
                 raise
@@ -433,14 +570,17 @@ class _Bound(nn.Module):
         self.estimator = estimator
 
     def forward(
-        self, batch: Callable[[], Batch], program: Mapping[str, Any], measure: Callable[[Terms], None] | None
-    ) -> dict[str, Any]:
-        terms = self.estimator.terms(self.model, batch(), **program)
+        self,
+        batch: Callable[[], Batch],
+        program: Mapping[str, Any],
+        measure: Callable[[Terms], Mapping[str, Tensor]] | None,
+    ) -> tuple[dict[str, Any], Mapping[str, Tensor]]:
+        terms, measured = self.estimator.terms(self.model, batch(), **program), dict[str, Tensor]()
         # measured here, because outside only fabric may compute gradients of the module's output
         if measure is not None and torch.is_grad_enabled():
             with torch.autocast(terms.n_steps.device.type, enabled=False):
-                measure(terms)
-        return dict(vars(terms))
+                measured |= measure(terms)
+        return dict(vars(terms)), measured
 
 
 def _sums(terms: Terms) -> dict[str, Tensor]:
@@ -460,7 +600,7 @@ def _per_step(sums: Mapping[str, Tensor]) -> dict[str, float]:
     return {name: rate for name, rate in zip(sums, rates, strict=True) if name != "steps"}
 
 
-def _describe_non_finite(model: nn.Module, terms: Terms, loss: Tensor) -> str:
+def _describe_non_finite(model: nn.Module, terms: Terms, loss: float) -> str:
     """Return a description of the first term, or else of the loss or a gradient, that is not finite."""
     groups = {"log likelihood": terms.log_likelihood, "KL": terms.kl, "energy": terms.energies}
     for group, values in groups.items():
@@ -473,8 +613,8 @@ def _describe_non_finite(model: nn.Module, terms: Terms, loss: Tensor) -> str:
                     steps = (~torch.isfinite(terms.steps[name])).any(0).nonzero().flatten().tolist()
                     location += f", time steps {', '.join(map(str, steps[:3]))}{'…' if len(steps) > 3 else ''}"
                 return f"{first} {location}"
-    if not torch.isfinite(loss):
-        return f"the loss is {loss.item()} although every term is finite, so a weight of the objective is not finite"
+    if not math.isfinite(loss):
+        return f"the loss is {loss} although every term is finite, so a weight of the objective is not finite"
     for name, parameter in model.named_parameters():
         if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
             return f"the gradient of {name} is not finite although the loss is"

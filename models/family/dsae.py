@@ -87,10 +87,10 @@ class Recurrence(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, base: Tensor, weight: Tensor) -> Tensor:
         """Return the states from base (T, B, W) and weight (W, W)."""
-        states = torch.empty_like(base)
-        state = torch.zeros_like(base[0])
-        for share, target in zip(base.unbind(0), states.unbind(0), strict=True):
-            state = torch.addmm(share, state, weight.t(), out=target).tanh_()
+        states = base.clone()
+        state, matrix = torch.zeros_like(base[0]), weight.t()
+        for target in states.unbind(0):
+            state = target.addmm_(state, matrix).tanh_()
         ctx.save_for_backward(states, weight)
         return states
 
@@ -99,13 +99,12 @@ class Recurrence(torch.autograd.Function):
     def backward(ctx: Any, to_states: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gradients of base and weight."""
         states, weight = ctx.saved_tensors
-        to_base = torch.empty_like(states)
-        targets, slopes, state_gradients = to_base.unbind(0), (1 - states * states).unbind(0), to_states.unbind(0)
-        carried = state_gradients[-1]
+        to_base = to_states.clone(memory_format=torch.contiguous_format)
+        targets, slopes = to_base.unbind(0), (1 - states * states).unbind(0)
         for t in range(len(states) - 1, -1, -1):
-            gradient = torch.mul(carried, slopes[t], out=targets[t])
+            targets[t].mul_(slopes[t])
             if t:
-                carried = torch.addmm(state_gradients[t - 1], gradient, weight)
+                targets[t - 1].addmm_(targets[t], weight)
         return to_base, to_base[1:].flatten(0, 1).t() @ states[:-1].flatten(0, 1)
 
 

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ...capture import is_deferring
 from ...data.batch import WHOLE, Batch
 from ...inference.training.checkpoints import CONFIG, CheckpointError, Run, at_most, load_weights
 from ...inference.training.fit import fit
@@ -36,9 +37,10 @@ from ...motion import HUMAN36M, HUMANEVA, Skeleton
 from ...motion.data.protocols import Poses
 from ...networks import Input, Network, NetworkSpec
 from ...networks.base import perceptron
-from ...networks.loop import memoize
+from ...networks.loop import memoize, store_result
 from ...options import Size, flat
 from ...program.batch import CHUNK, AnyBatch, repeat, rows
+from ...program.groups import Groups
 from ...program.rollout import Rollout
 from ..baselines.cvae import CVAE, SummaryDecoder
 from ..registry import configured
@@ -217,8 +219,14 @@ class ModesModel(FutureModel):
         """
         size = len(data[HISTORY])
         codes = self._one_hot(modes.repeat_interleave(size), data[HISTORY])
-        group = torch.arange(size, device=codes.device).repeat(len(modes))
-        return Batch(repeat(data, len(modes))) | {MODE: codes, "group": group}
+        windows = torch.arange(size, device=codes.device)
+        group = windows.repeat(len(modes))
+        count = torch.full_like(group, len(modes))
+        # known here; to find either in the values would synchronise with a GPU
+        store_result(self.reader, [group], Groups(group, windows, count))
+        repeated = Batch(repeat(data, len(modes)))
+        store_result(self.sampler.heads, [repeated[HISTORY]], len(modes) == self.modes)
+        return repeated | {MODE: codes, "group": group}
 
     def _one_hot(self, modes: Tensor, like: Tensor) -> Tensor:
         """Return one-hot codes (B, K) of modes (B,), with the type and device of `like`."""
@@ -311,10 +319,10 @@ class ModesModel(FutureModel):
             samples: S. If it is not a multiple of the number of modes, the last samples are of random modes.
             chunk: largest number of windows times modes at once.
         """
-        size, step = len(data[HISTORY]), max(chunk // self.modes, 1)
+        size, step, device = len(data[HISTORY]), max(chunk // self.modes, 1), data[HISTORY].device
         n_full, n_rest = divmod(samples, self.modes)
-        sets = [(torch.arange(self.modes), n_full)] if n_full or not n_rest else []
-        sets += [(torch.randperm(self.modes)[:n_rest], 1)] if n_rest else []
+        sets = [(torch.arange(self.modes, device=device), n_full)] if n_full or not n_rest else []
+        sets += [(torch.randperm(self.modes, device=device)[:n_rest], 1)] if n_rest else []
 
         def parts() -> Iterator[dict[str, Tensor]]:
             for first in range(0, max(size, 1), step):
@@ -414,7 +422,11 @@ class Sampler(nn.Module):
 
         def compute() -> Tensor:
             count, remainder = divmod(len(history), self.modes)
-            is_repeated = not remainder and torch.equal(history[count:], history[:-count])
+
+            def is_equal() -> bool:
+                return not (remainder or is_deferring()) and torch.equal(history[count:], history[:-count])
+
+            is_repeated = memoize(self.heads, [history], is_equal)  # `in_modes` stores it
             parameters: Tensor = self.heads(self.behind(self.past(history[:count] if is_repeated else history)))
             return parameters.unflatten(1, (self.modes, -1))
 

@@ -23,6 +23,7 @@ from pyro import poutine
 from torch import Tensor
 from typing_extensions import override
 
+from ...capture import defer
 from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
 from ...data.views import Past, View, Views
@@ -317,7 +318,7 @@ class TrajectoryModel(DynamicalVAE):
             )
         if trajectories.shape[1] < horizon:
             raise ValueError(f"the trajectories have {trajectories.shape[1]} frames, but the horizon is {horizon}")
-        if not trajectories.isfinite().all():
+        if not defer(failed := ~trajectories.isfinite().all()) and failed:
             raise ValueError(
                 "trajectories must be finite, and 0 at joints that are not given; `complete` accepts paths "
                 "with missing frames"

@@ -1,6 +1,7 @@
 """Steps and evaluations of every method on a GPU, or without one on a stand-in device."""
 
 import warnings
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import ClassVar
 
@@ -12,16 +13,18 @@ from torch.utils._pytree import tree_leaves
 
 import dvae
 from dvae import motion
+from dvae.capture import WARM_UP, Captured
 from dvae.data.batch import Batch
 from dvae.distributions.chain import gaussian_chain
 from dvae.distributions.kalman import LinearGaussianChain
 from dvae.inference.evaluation.evaluation_windows import on_device_of
+from dvae.inference.training.svi import NonFiniteError
 from dvae.models.motion.motion_latent import MotionLatent
 from dvae.models.motion.trajectories import TrajectoryMethod
 from dvae.models.registry import METHODS
 from dvae.motion import bodies
 from dvae.motion.segments.embodied import Segments
-from dvae.testing.device import OnDevice, SameNoise, move, on_device
+from dvae.testing.device import OnDevice, SameNoise, Tape, move, on_device
 
 DENSE = {"latent": 4, "width": 8, "hidden": (8,)}
 SMALL = {
@@ -49,15 +52,9 @@ STEP = {
 """Number of synchronisations of each step, by file."""
 BESIDE = {
     "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of each coupling
-    "hit-dvae": {"scoring/energies.py": 1},  # the number of admissible futures is a shape
-    "gsps": {"scoring/energies.py": 1},
-    "dlow": {"program/groups.py": 1, "motion/modes.py": 1},  # the number of windows, and repeated histories
-    "dsf": {"motion/modes.py": 1},
     "mix-and-match": {"program/rollout.py": 1},  # which frames are sampled, so that a loop skips the others
     "motion-latent": {"training/gradnorm.py": 1},  # losses and gradient norms, which determine the weights
 }
-BROUGHT = {"mix-and-match": 1}
-"""Tensors uploaded in each step in addition to the batch: indices shared by all sequences."""
 
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU is here")
@@ -77,11 +74,11 @@ def segments():
 def small_method(request, people):
     """Return a function of a method's name: a small model, its recipe, training windows and test windows."""
 
-    def make(name):
+    def make(name, steps=4):
         torch.manual_seed(0)
         if name == "motion-latent":
             method, train = MotionLatent(**SMALL[name]), request.getfixturevalue("segments")
-            return method.build(train), method.train(train, None, 4), train, None
+            return method.build(train), method.train(train, None, steps), train, None
         of_paths = issubclass(dvae.methods()[name], TrajectoryMethod)
         protocol = motion.PROTOCOLS["simulated-trajectories" if of_paths else "simulated"]
         cut = {"predicted": 8, "observed": min(protocol.observed, 6), "train_stride": 15, "test_stride": 25}
@@ -89,7 +86,7 @@ def small_method(request, people):
         data = motion.MotionData("simulated", people, replace(protocol, **cut))
         train = data.windows("train")
         method = dvae.method(name, **SMALL.get(name, {"latent": 4, "warm_up": 1})).resolve_defaults(train)
-        model, recipe = method.build(data.schema), method.train(train, None, 4)
+        model, recipe = method.build(data.schema), method.train(train, None, steps)
         recipe.prepare(model)
         return model, recipe, train, data.windows("test")
 
@@ -107,24 +104,31 @@ def two_steps(model, recipe, before_the_second=lambda: None, accelerator="cpu"):
     return (first, svi.step(batch)), len(Batch(batch).leaves()), svi
 
 
+@contextmanager
+def simulated_gpu():
+    """Simulate a GPU that lightning-fabric uses."""
+    with pytest.MonkeyPatch.context() as patch, on_device() as traffic:
+        patch.setattr(SingleDeviceStrategy, "root_device", OnDevice.device)
+        patch.setattr(CPUAccelerator, "setup_device", lambda *_: None)
+        yield traffic
+
+
 def numbers(terms):
     tables = ((kind, getattr(terms, kind)) for kind in ("log_likelihood", "kl", "energies", "steps"))
     return {(kind, name): value for kind, table in tables for name, value in table.items()}
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_step_on_a_device_equals_the_cpu_with_the_listed_synchronizations(name, small_method, monkeypatch):
+def test_a_step_on_a_device_equals_the_cpu_with_the_listed_synchronizations(name, small_method):
     """Training, validation, forecasts and scores equal those on the CPU."""
     model, recipe, _, _ = small_method(name)
     expected, _, _ = two_steps(model.double(), recipe)
     model, recipe, train, test = small_method(name)
-    monkeypatch.setattr(SingleDeviceStrategy, "root_device", OnDevice.device)
-    monkeypatch.setattr(CPUAccelerator, "setup_device", lambda *_: None)
-    with on_device() as traffic:
+    with simulated_gpu() as traffic:
         terms, tensors, svi = two_steps(move(model.double()), recipe, traffic.clear)
         places = [entry.partition(":")[0] for entry in traffic.reads]
         assert {place: places.count(place) for place in places} == STEP | BESIDE.get(name, {}), traffic.reads
-        assert len(traffic.uploads) == tensors + BROUGHT.get(name, 0), traffic.uploads
+        assert len(traffic.uploads) == tensors, traffic.uploads
         validate_and_score(svi, train, test)
         assert_same(terms, expected)
 
@@ -175,7 +179,7 @@ def test_a_gpu_synchronizes_as_often_as_the_stand_in(name, small_method):
     synchronizations = [
         f"{warning.filename}:{warning.lineno}" for warning in waited if "synchronizing CUDA" in str(warning.message)
     ]
-    assert len(synchronizations) == sum((STEP | BESIDE.get(name, {})).values()) + BROUGHT.get(name, 0), synchronizations
+    assert len(synchronizations) == sum((STEP | BESIDE.get(name, {})).values()), synchronizations
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=on_gpu)])
@@ -242,6 +246,210 @@ def test_a_loop_over_time_neither_synchronizes_nor_uploads(loop, option):
         torch.autograd.grad(sum(part.sum() for part in run() if part is not None), inputs, allow_unused=True)
         assert not traffic.reads
         assert not traffic.uploads
+
+
+# ------------------------------------------------------------------------------------------------------ CUDA graphs
+
+
+UNCAPTURED = {"moglow": "conditional_flow.py"}
+"""Methods whose steps run without a graph, and where they read a value of the GPU."""
+
+
+def steps_of(svi, recipe, count):
+    """Return the terms and the loss of each step."""
+    results = []
+    for _ in range(count):
+        terms = svi.step(recipe.batches.sample(3, svi.generator))
+        loss = {("loss", ""): torch.tensor(svi.row()["loss"])}
+        results.append({key: value.cpu().double() for key, value in (numbers(terms) | loss).items()})
+    return results
+
+
+@pytest.mark.filterwarnings("ignore:the training step runs without a CUDA graph")
+@pytest.mark.parametrize("name", METHODS)
+def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
+    """Draws are equal bit for bit, and terms up to rounding."""
+    count, runs = 12 if name == "mix-and-match" else 7, []  # a curriculum has a graph only once it is constant
+    for simulated in (False, True):
+        model, recipe, _, _ = small_method(name, count)
+        options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False}
+        options["learning_rate"] = 2**-10  # exact in float32, in which graphs read it
+        with simulated_gpu() if simulated else nullcontext():
+            model = move(model.double()) if simulated else model.double()
+            svi = dvae.SVI(model, stages=recipe.stages, cuda_graph=simulated, **options)
+            svi.init()
+            runs.append((steps_of(svi, recipe, count), svi.random["torch"]))
+    torch.testing.assert_close(runs[1][0], runs[0][0], rtol=1e-7, atol=1e-7)
+    assert torch.equal(runs[1][1], runs[0][1])
+    obstacles = [place for places in svi.captured.obstacles.values() for place in places]
+    if name in UNCAPTURED:
+        assert obstacles
+        assert all(UNCAPTURED[name] in place for place in obstacles)
+    else:
+        assert not obstacles
+        assert svi.captured.graphs
+
+
+@on_gpu
+@pytest.mark.filterwarnings("ignore:the training step runs without a CUDA graph")
+@pytest.mark.parametrize("name", METHODS)
+def test_replayed_steps_on_a_gpu_equal_steps_without_graphs(name, small_method):
+    """In single precision, over 50 steps; the random states are equal."""
+    count, runs = 50, []
+    for cuda_graph in (False, True):
+        model, recipe, _, _ = small_method(name, count)
+        options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False, "accelerator": "cuda"}
+        svi = dvae.SVI(model, stages=recipe.stages, cuda_graph=cuda_graph, **options)
+        svi.init()
+        runs.append((steps_of(svi, recipe, count), svi.random))
+    assert bool(svi.captured.graphs) == (name not in UNCAPTURED)
+    torch.testing.assert_close(runs[1][0], runs[0][0], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(runs[1][1], runs[0][1], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", ["srnn", "hit-dvae", "gsps", "trajevae", "mix-and-match", "dlow"])
+def test_replayed_forecasts_have_the_same_scores(name, small_method, monkeypatch):
+    model, _, windows, _ = small_method(name)
+    options = {"scores": motion.displacements, "samples": 2, "references": False, "progress": False, "batch_size": 1}
+    expected = dvae.evaluate(model.double().eval(), windows, **options)
+    replays, replay = [], Tape.replay
+    monkeypatch.setattr(Tape, "replay", lambda tape: replays.append(replay(tape)))
+    with simulated_gpu():
+        result = dvae.evaluate(move(model), windows, cuda_graph=True, **options)
+    for score, value in expected["model"].items():
+        assert result["model"][score].mean == pytest.approx(value.mean, 1e-9)
+    assert len(replays) == len(windows.keys) - WARM_UP
+
+
+class TestCapturedStep:
+    """Steps of a small model, replayed as a graph."""
+
+    def svi(self, cuda_graph, **options):
+        torch.manual_seed(0)
+        model = dvae.DynamicalVAE(
+            "p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 2, "x": 3}
+        ).double()
+        svi = dvae.SVI(move(model) if cuda_graph else model, steps=20, progress=False, cuda_graph=cuda_graph, **options)
+        svi.init()
+        return svi
+
+    def batches(self, count=10):
+        return torch.randn(count, 4, 5, 3, generator=torch.Generator().manual_seed(1)).double()
+
+    def weights(self, svi):
+        return {name: value.cpu().clone() for name, value in svi.model.state_dict().items()}
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {},
+            {"optimizer": "sgd", "momentum": 0.9},
+            {"optimizer": "adamw", "weight_decay": 0.1, "decay": 1.0, "gradient_clip": 0.1},
+            {"objective": dvae.Evidence(kl_weight={"z": dvae.schedules.Ramp(0.0, 1.0, steps=10)}, free_bits=0.1)},
+            {"scheduled_sampling": dvae.schedules.Ramp(0.1, 0.9, steps=10)},
+            {"particles": 3},
+        ],
+    )
+    def test_it_follows_the_schedules_of_a_step_on_the_cpu(self, options):
+        expected = self.svi(False, **options)
+        losses = [(expected.step(batch), expected.row()["loss"])[1] for batch in self.batches()]
+        with simulated_gpu():
+            svi = self.svi(True, **options)
+            assert [(svi.step(batch), svi.row()["loss"])[1] for batch in self.batches()] == pytest.approx(losses, 1e-6)
+            assert len(svi.captured.graphs) == 1
+            torch.testing.assert_close(self.weights(svi), self.weights(expected), rtol=1e-6, atol=1e-6)
+
+    def test_a_step_that_is_refused_changes_no_weights(self):
+        *batches, last = self.batches()
+        with simulated_gpu():
+            svi = self.svi(True)
+            for batch in batches:
+                svi.step(batch)
+            before = self.weights(svi)
+            with pytest.raises(NonFiniteError, match="step 10: the log likelihood of x is -inf"):
+                svi.step(1e200 * last)
+            with pytest.raises(ValueError, match="x has NaN or infinite values"):
+                svi.step(torch.full_like(last, torch.nan))
+            torch.testing.assert_close(self.weights(svi), before, rtol=0, atol=0)
+            svi.step(last)
+            assert svi.state.step == 10
+
+    def test_it_continues_after_a_checkpoint(self, tmp_path):
+        data = self.batches().flatten(0, 1)
+        options = {"batch_size": 8, "validate_every": 6, "progress": False, "cuda_graph": True}
+
+        def model():
+            torch.manual_seed(0)
+            sizes = {"z": 2, "x": 3}
+            return move(
+                dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-1}, x_t)", sizes).double()
+            )
+
+        with simulated_gpu():
+            whole = dvae.fit(model(), data, steps=12, **options)
+            dvae.fit(model(), data, steps=6, out=tmp_path / "run", **options)
+            resumed = dvae.fit(model(), data, steps=12, out=tmp_path / "run", resume=True, **options)
+            loss = [row["loss"] for row in (whole.history[-1], resumed.history[-1])]
+        assert loss[1] == pytest.approx(loss[0], 1e-6)
+
+    def test_each_shape_of_batch_has_its_graph(self):
+        expected, batches = self.svi(False), self.batches()
+        mixed = [part for batch in batches for part in (batch, batch[:2, :4])]
+        losses = [(expected.step(batch), expected.row()["loss"])[1] for batch in mixed]
+        with simulated_gpu():
+            svi = self.svi(True)
+            assert [(svi.step(batch), svi.row()["loss"])[1] for batch in mixed] == pytest.approx(losses, 1e-6)
+            assert len(svi.captured.graphs) == 2
+
+    def test_an_objective_without_weights_is_not_replayed(self):
+        def objective(terms, step):
+            return -terms.bound.sum() * (step + 1)
+
+        with simulated_gpu(), pytest.warns(UserWarning, match="without a CUDA graph: objective has no weights"):
+            assert self.svi(True, objective=objective).captured is None
+
+    def test_a_processor_has_no_graphs(self):
+        svi = dvae.SVI(torch.nn.Linear(1, 1), cuda_graph=True, accelerator="cpu")
+        with pytest.warns(UserWarning, match="without a CUDA graph: the device is a cpu"):
+            svi.init()
+
+
+class TestCaptured:
+    """The simulated graphs of any function."""
+
+    def results(self, function, warning=None, count=6):
+        """Return the results of calls with x = 1, 2, …, and the graphs."""
+        with on_device():
+            captured = Captured(function, "this function", OnDevice.device)
+            with pytest.warns(UserWarning, match=warning) if warning else nullcontext():
+                values = [captured(None, {"x": torch.tensor([float(n)])})["y"].cpu().item() for n in range(1, count)]
+            return values, captured.graphs
+
+    def test_decisions_of_python_stay_as_they_were_in_the_recording(self):
+        calls = iter(range(100))
+        values, graphs = self.results(lambda inputs: {"y": inputs["x"] * 10 + next(calls)})
+        assert values == [10, 21, 32, 43, 53]
+        assert len(graphs) == 1
+
+    @pytest.mark.parametrize(
+        ("function", "warning"),
+        [
+            (lambda inputs: {"y": inputs["x"] * inputs["x"].item()}, r"test_device.py:\d+ reads a value of the GPU"),
+            (lambda inputs: {"y": inputs["x"] * inputs["x"][inputs["x"] > 0]}, r"test_device.py:\d+ reads a value"),
+            (lambda inputs: {"y": inputs["x"] ** 2 + (torch.rand(()) < 0)}, "aten.rand.default draws on the CPU"),
+        ],
+    )
+    def test_a_function_that_a_graph_cannot_repeat_is_run_itself(self, function, warning):
+        values, graphs = self.results(function, f"this function runs without a CUDA graph: .*{warning}")
+        assert values == [1, 4, 9, 16, 25]
+        assert not graphs
+
+    def test_a_recording_changes_nothing(self):
+        """A GPU computes nothing while it records, so a counter rises once per call."""
+        with on_device():
+            count = torch.zeros(1).to("cuda")
+            captured = Captured(lambda _: {"y": count.add_(1)}, "this function", OnDevice.device)
+            assert [captured(None, {})["y"].cpu().item() for _ in range(6)] == [1, 2, 3, 4, 5, 6]
 
 
 # ------------------------------------------------------------------------------------------------ the device itself

@@ -25,6 +25,7 @@ import re
 import torch
 from torch import Tensor
 
+from ...capture import is_deferring
 from ...constants import constant
 from ...lazy import optional
 
@@ -77,13 +78,14 @@ def to_matrix(values: Tensor, form: str) -> Tensor:
         shortest = torch.finfo(values.dtype).eps
         first, second = values.unflatten(-1, (2, 3)).unbind(-2)
         # the condition avoids a `where` in the usual case, which would double the cost of gradients
-        if (short := first.norm(dim=-1, keepdim=True) < shortest).any():
+        short = first.norm(dim=-1, keepdim=True) < shortest
+        if is_deferring() or short.any():
             first = torch.where(short, constant((1.0, 0.0, 0.0), values), first)
         with torch.no_grad():
             axis = torch.nn.functional.normalize(first, dim=-1)
             distance = (second - (axis * second).sum(-1, keepdim=True) * axis).norm(dim=-1, keepdim=True)
             is_parallel = distance <= (shortest**0.5 * second.norm(dim=-1, keepdim=True)).clamp(shortest)
-        if is_parallel.any():
+        if is_deferring() or is_parallel.any():
             second = torch.where(is_parallel, perpendicular(torch.nn.functional.normalize(first, dim=-1)), second)
         return roma.special_gramschmidt(torch.stack([first, second], -1))
     return roma.euler_to_rotmat(form.removeprefix("euler-").upper(), values)
