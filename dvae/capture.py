@@ -1,12 +1,13 @@
 """CUDA graphs: a function of tensors is recorded once on a GPU, and replayed without Python.
 
 Small networks leave a GPU idle while Python starts one kernel after the other. A CUDA graph starts all kernels of the
-function at once. Its kernels and their shapes are those of the recording, so everything that changes between calls is
-in the tensors that the function receives, and the function must not read a value of the GPU.
+function at once. Its kernels and their shapes are those of the recording. Everything that changes between calls is
+therefore in the tensors that the function receives, and the function must not read a value of the GPU.
 """
 
 from __future__ import annotations
 
+import gc
 import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -17,16 +18,21 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.weak import WeakIdKeyDictionary
 from typing_extensions import override
 
 WARM_UP = 3
 """Calls of a kind before its graph is recorded; libraries allocate memory and choose algorithms in the first ones."""
-SYNCHRONIZES = "called a synchronizing CUDA operation"
-"""Warning of torch for a synchronisation."""
 MOST_GRAPHS, MOST_KINDS = 16, 1000
 """Largest number of graphs, each with the memory of one call, and of kinds whose calls are counted."""
+SYNCHRONIZES = "called a synchronizing CUDA operation"
+"""Warning of torch for a synchronisation."""
+PROTOTYPE = "Synchronization debug mode is a prototype"
+"""Warning of torch for the mode that warns of synchronisations."""
 
 _CHECKS: ContextVar[list[Tensor] | None] = ContextVar("checks", default=None)
+Function = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
 
 
 @contextmanager
@@ -62,6 +68,145 @@ def any_failed(checks: list[Tensor], device: torch.device) -> Tensor:
     return torch.stack(checks).any() if checks else torch.zeros((), dtype=torch.bool, device=device)
 
 
+class Captured:
+    """Functions on a GPU that are replayed as CUDA graphs, one for each kind of call.
+
+    The first calls of a kind run the function itself. The last of them count what a graph cannot repeat: reads of the
+    GPU's values, uploads of other tensors and random numbers of the CPU. If there are any, calls of this kind always
+    run the function, and a warning gives the reasons once.
+
+    Args:
+        name: name of the functions, for warnings and errors.
+        device: the GPU.
+    """
+
+    def __init__(self, name: str, device: torch.device) -> None:
+        self.name = name
+        self.device = device
+        self.recording = False
+        self.obstacles = dict[Hashable, list[str]]()
+        self.graphs = dict[Hashable, _Graph]()
+        self._stream: Any = torch.cuda.Stream(device)
+        self._calls = Counter[Hashable]()
+
+    def __call__(self, kind: Hashable, function: Function, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the results of the function; those of a graph are overwritten by its next replay.
+
+        Args:
+            kind: value that determines the function's operations, except for the shapes and types of the inputs.
+            function: function from a dictionary of tensors on the GPU to another. Within a kind, it may depend on
+                nothing else that changes, except parameters and buffers, which it may change in place.
+            inputs: tensors by name, on the CPU or the GPU.
+
+        Raises:
+            RuntimeError: the function cannot be recorded, for a reason that its first calls have not shown.
+        """
+        kind = (kind, *((name, value.shape, value.dtype) for name, value in inputs.items()))
+        if kind in self.graphs:
+            return self.graphs[kind].replay(inputs)
+        device_inputs = {name: value.to(self.device, non_blocking=True) for name, value in inputs.items()}
+        if len(self._calls) > MOST_KINDS:
+            self._calls.clear()
+        self._calls[kind] += 1
+        if self._calls[kind] <= WARM_UP:
+            return self._warm_up(kind, function, device_inputs)
+        if kind in self.obstacles:
+            return function(device_inputs)
+        if len(self.graphs) == MOST_GRAPHS:
+            self._warn(f"there are {MOST_GRAPHS} graphs for other shapes already")
+            self.obstacles[kind] = []
+            return function(device_inputs)
+        self.graphs[kind] = self._record(function, device_inputs)
+        return self.graphs[kind].replay(inputs)
+
+    def _record(self, function: Function, inputs: Mapping[str, Tensor]) -> _Graph:
+        memory = {name: value.clone() for name, value in inputs.items()}
+        graph, current = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self.device)
+        gc.collect()  # the memory of a graph that is collected during a recording would invalidate it
+        self.recording = True
+        try:
+            # other threads may use the GPU meanwhile
+            with (
+                _Reads() as reads,
+                torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
+            ):
+                results = function(memory)
+        except RuntimeError as error:
+            torch.cuda.set_stream(current)  # torch does not leave the stream of a recording that fails
+            raise RuntimeError(
+                f"{self.name} cannot be recorded as a CUDA graph: {error.__context__ or error}; set cuda_graph=False"
+            ) from error
+        finally:
+            self.recording = False
+        return _Graph(graph, memory, results, [*reads.tensors.values()])
+
+    def _warm_up(self, kind: Hashable, function: Function, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Run the function on the stream of the recording; the last two calls look for obstacles."""
+        current, draws, caught = torch.cuda.current_stream(self.device), _HostDraws(), list[warnings.WarningMessage]()
+        self._stream.wait_stream(current)
+        with torch.cuda.stream(self._stream), ExitStack() as stack:
+            if self._calls[kind] == WARM_UP - 1:
+                stack.enter_context(draws)
+            elif self._calls[kind] == WARM_UP:
+                caught = stack.enter_context(_synchronizations())
+            results = function(inputs)
+        current.wait_stream(self._stream)
+        obstacles = list(draws.names)
+        for each in caught:
+            if SYNCHRONIZES in str(each.message):
+                obstacles.append(f"{each.filename}:{each.lineno} reads a value of the GPU, or uploads one")
+            elif PROTOTYPE not in str(each.message):
+                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+        if obstacles:
+            self._warn("; ".join(dict.fromkeys(obstacles)))
+            self.obstacles[kind] = obstacles
+        return results
+
+    def _warn(self, reasons: str) -> None:
+        """Warn of the first kind without a graph."""
+        if not self.obstacles:
+            warnings.warn(f"{self.name} runs without a CUDA graph: {reasons}", stacklevel=5)
+
+
+class _Graph:
+    """A recorded function.
+
+    Args:
+        graph: CUDA graph.
+        memory: inputs of the recording by name, which each replay overwrites.
+        results: results of the recording by name, which each replay overwrites.
+        reads: all other tensors that the graph reads. They must stay in memory, such as constants in a cache.
+    """
+
+    def __init__(self, graph: Any, memory: dict[str, Tensor], results: dict[str, Tensor], reads: list[Tensor]) -> None:
+        self.graph, self.memory, self.results, self.reads = graph, memory, results, reads
+
+    def replay(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the results for new inputs."""
+        for name, value in inputs.items():
+            self.memory[name].copy_(value, non_blocking=True)
+        self.graph.replay()
+        return self.results
+
+
+class _Reads(TorchDispatchMode):
+    """Mode that collects the tensors that operations read without having computed them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tensors = dict[int, Tensor]()
+        self._computed = WeakIdKeyDictionary()
+
+    @override
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        for value in tree_leaves((args, kwargs)):
+            if isinstance(value, Tensor) and value not in self._computed:
+                self.tensors[id(value)] = value
+        result = func(*args, **(kwargs or {}))
+        self._computed.update({value: True for value in tree_leaves(result) if isinstance(value, Tensor)})
+        return result
+
+
 class _HostDraws(TorchDispatchMode):
     """Mode that lists the random operations on the CPU, whose results a graph would repeat."""
 
@@ -72,89 +217,11 @@ class _HostDraws(TorchDispatchMode):
     @override
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
-        results = result if isinstance(result, tuple) else (result,)
-        if torch.Tag.nondeterministic_seeded in func.tags and any(each.device.type == "cpu" for each in results):
-            self.names.append(f"{func} draws on the CPU")
+        if torch.Tag.nondeterministic_seeded in func.tags:
+            tensors = [value for value in tree_leaves((args, kwargs, result)) if isinstance(value, Tensor)]
+            if all(value.device.type == "cpu" for value in tensors):  # fused attention on a GPU has CPU seeds
+                self.names.append(f"{func} draws on the CPU")
         return result
-
-
-class Captured:
-    """A function on a GPU that is replayed as a CUDA graph, one for each kind of call.
-
-    The first calls of a kind run the function itself. The last of them counts what a graph cannot repeat: reads of the
-    GPU's values, uploads of other tensors and random numbers of the CPU. If there are any, calls of this kind always
-    run the function, and a warning gives the reasons once.
-
-    Args:
-        function: function from a dictionary of tensors on the GPU to another. Within a kind, it may depend on nothing
-            else that changes, except parameters and buffers, which it may change in place.
-        name: name of the function, for the warning.
-        device: the GPU.
-    """
-
-    def __init__(
-        self, function: Callable[[Mapping[str, Tensor]], dict[str, Tensor]], name: str, device: torch.device
-    ) -> None:
-        self.function = function
-        self.name = name
-        self.device = device
-        self.stream: Any = torch.cuda.Stream(device)
-        self.obstacles = dict[Hashable, list[str]]()
-        self._calls = Counter[Hashable]()
-        self.graphs = dict[Hashable, tuple[Any, dict[str, Tensor], dict[str, Tensor]]]()
-
-    def __call__(self, kind: Hashable, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the results of the function; those of a graph are overwritten by its next replay.
-
-        Args:
-            kind: value that determines the function's operations, except for the shapes and types of the inputs.
-            inputs: tensors by name, on the CPU or the GPU.
-        """
-        kind = (kind, *((name, value.shape, value.dtype) for name, value in inputs.items()))
-        if kind in self.graphs:
-            graph, memory, results = self.graphs[kind]
-            for name, value in inputs.items():
-                memory[name].copy_(value, non_blocking=True)
-            graph.replay()
-            return results
-        device_inputs = {name: value.to(self.device, non_blocking=True) for name, value in inputs.items()}
-        if len(self._calls) > MOST_KINDS:
-            self._calls.clear()
-        self._calls[kind] += 1
-        if kind in self.obstacles or len(self.graphs) == MOST_GRAPHS or self._calls[kind] <= WARM_UP:
-            return self._run(kind, device_inputs)
-        memory = {name: value.clone() for name, value in device_inputs.items()}
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=self.stream):
-            results = self.function(memory)
-        self.graphs[kind] = graph, memory, results
-        graph.replay()
-        return results
-
-    def _run(self, kind: Hashable, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Run the function without a graph, and find obstacles in the last warm-up calls."""
-        if self._calls[kind] > WARM_UP:
-            return self.function(inputs)
-        current, draws, caught = torch.cuda.current_stream(self.device), _HostDraws(), list[warnings.WarningMessage]()
-        self.stream.wait_stream(current)
-        with torch.cuda.stream(self.stream), ExitStack() as stack:  # the stream of the recording
-            if self._calls[kind] == WARM_UP - 1:
-                stack.enter_context(draws)
-            elif self._calls[kind] == WARM_UP:
-                caught = stack.enter_context(_synchronizations())
-            results = self.function(inputs)
-        current.wait_stream(self.stream)
-        places = [f"{each.filename}:{each.lineno}" for each in caught if SYNCHRONIZES in str(each.message)]
-        for each in caught:
-            if SYNCHRONIZES not in str(each.message):
-                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-        obstacles = [*draws.names, *(f"{place} reads a value of the GPU, or uploads one" for place in places)]
-        if obstacles:
-            if not self.obstacles:
-                reasons = "; ".join(dict.fromkeys(obstacles))
-                warnings.warn(f"{self.name} runs without a CUDA graph: {reasons}", stacklevel=5)
-            self.obstacles[kind] = obstacles
-        return results
 
 
 @contextmanager

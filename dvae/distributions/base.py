@@ -236,7 +236,7 @@ class ConditionalDistribution(nn.Module):
 
 def unexpanded(parameter: Tensor) -> Tensor:
     """Return a parameter (..., D) without the first dimensions if it has been expanded to them, such as (D,)."""
-    while parameter.dim() > 1 and (len(parameter) == 1 or not parameter.stride(0)):
+    while parameter.dim() > 1 and len(parameter) and (len(parameter) == 1 or not parameter.stride(0)):
         parameter = parameter[0]
     return parameter
 

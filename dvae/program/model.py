@@ -42,9 +42,6 @@ from .forecast import forecast, impute, reconstruct, states
 from .rollout import InputNoise, Rollout, ScheduledSampling
 
 _COUNT = itertools.count()
-# Between steps, glibc may return freed memory to the system, which costs up to a quarter of a training step in page
-# faults. Freeing a block of just under 32 MiB raises its limit for this to 64 MiB (M_MMAP_THRESHOLD in mallopt(3)).
-torch.empty(2**25 - 2**14, dtype=torch.uint8, device="cpu")
 SHARED: Any = {"shared": True}
 """The `infer` entry that marks the site of a variable shared by all sequences."""
 

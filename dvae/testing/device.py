@@ -312,6 +312,7 @@ def on_device() -> Iterator[Traffic]:
             "Stream": stream,
             "stream": stream,
             "current_stream": stream,
+            "set_stream": stream,
             "graph": graph,
             "set_sync_debug_mode": traffic.set_sync_debug_mode,
             "get_sync_debug_mode": lambda: traffic.sync_debug_mode,

@@ -328,17 +328,17 @@ def forecaster_of(
         futures: Tensor = model.forecast(on_device_of(model, windows.past(part)), horizon, samples, **options)["x"]
         return futures
 
+    if not cuda_graph or device.type != "cuda":
+        return forecast
+    captured = Captured("a forecast", device)
+
     def record(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         with deferring() as checks:
             futures = model.forecast(Batch.from_leaves(inputs), horizon, samples, **options)["x"]
         return {"x": futures, "failed": any_failed(checks, device)}
 
-    if not cuda_graph or device.type != "cuda":
-        return forecast
-    captured = Captured(record, "a forecast", device)
-
     def replay(part: slice) -> Tensor:
-        results = captured(None, on_device_of(model, windows.past(part)).leaves())
+        results = captured(None, record, on_device_of(model, windows.past(part)).leaves())
         return forecast(part) if results["failed"] else results["x"]  # raises the error of the failed check
 
     return replay

@@ -72,7 +72,7 @@ class StatefulObjective(Objective, Protocol):
         """Return quantities of a batch by name, before the backward pass; the autograd graph must be retained."""
 
     def adapt(self, measured: Mapping[str, Tensor], mean: Callable[[Tensor], Tensor]) -> None:
-        """Update the state after the backward pass and its checks.
+        """Update the state after the backward pass and its checks; before the optimiser's step, except in CUDA graphs.
 
         Args:
             measured: result of `measure`.
@@ -140,8 +140,9 @@ class Evidence:
         values: dict[str, float] = {}
         for option in ("kl_weight", "energy_weights"):
             given = getattr(self, option)
-            by_name = given.items() if isinstance(given, Mapping) else [("", given)]
-            values |= {f"{option}/{name}".rstrip("/"): schedule(weight)(step) for name, weight in by_name}
+            by_name = isinstance(given, Mapping)
+            weights = {f"{option}/{name}": value for name, value in given.items()} if by_name else {option: given}
+            values |= {name: schedule(weight)(step) for name, weight in weights.items()}
         return values
 
     def loss(self, terms: "Terms", weights: Mapping[str, Any]) -> Tensor:

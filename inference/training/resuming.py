@@ -88,6 +88,7 @@ def restore(svi: SVI, run: Run) -> None:
         # Options such as weight_decay come from this fit, not from the checkpoint.
         options = svi.optimizer.state_dict()["param_groups"]
         svi.optimizer.load_state_dict({"state": moments, "param_groups": options})
+        svi.reset_graphs()
         svi.generator.set_state(random.pop("generator"))
         svi.random |= {name: value for name, value in random.items() if name in svi.random}
         with svi.drawing():  # fails if the tensors are not states of a generator

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
@@ -182,25 +183,32 @@ class SVI:
             torch.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
             self.random = self._random_state()
         self._state, self._stage_objective = State(self.model), {}
-        self.captured = self._capture()
-        self._recorded: tuple[Stage, dict[str, float], list[str]] | None = None
+        self.reset_graphs()
         return self._state
 
-    def _capture(self) -> Captured | None:
-        """Return the step as a function for CUDA graphs; None without the option, or if something prevents them."""
+    def reset_graphs(self) -> None:
+        """Drop all CUDA graphs, so that later steps record new ones: after the optimiser's state has got other tensors.
+
+        If the option is set and there can be none, a warning says why.
+        """
+        self.captured: Captured | None = None
         if not self.training.cuda_graph:
-            return None
-        kind = self.fabric.device.type
+            return
+        kind, optimizer = self.fabric.device.type, self.optimizer.optimizer
         obstacles = [] if kind == "cuda" else [f"the device is a {kind}"]
         obstacles += ["processes exchange their gradients"] if self.fabric.world_size > 1 else []
         for objective in {id(stage.objective): stage.objective for stage in self.plan}.values():
-            if not isinstance(objective, WeightedObjective):
+            begun = objective.begin(self.model) if isinstance(objective, AdaptiveObjective) else objective
+            if not _is_weighted(begun):
                 name = getattr(objective, "__name__", type(objective).__name__)
                 obstacles.append(f"{name} has no weights as `WeightedObjective` does")
         if obstacles:
             warnings.warn(f"the training step runs without a CUDA graph: {'; '.join(obstacles)}", stacklevel=3)
-            return None
-        return Captured(self._record, "the training step", self.fabric.device)
+            return
+        self.captured = Captured("the training step", self.fabric.device)
+        for parameter in self.parameters if self.training.momentum else ():
+            # torch would leave it uninitialised if the first step is refused
+            optimizer.state[parameter].setdefault("momentum_buffer", torch.zeros_like(parameter))
 
     @serialized
     @torch.inference_mode(False)
@@ -234,6 +242,7 @@ class SVI:
                 batch, stage.objective, f"step {step + 1}", rates["scheduled_sampling"], rates.get("curriculum")
             )
             gradients, numbers = self._differentiate(objective(terms, step), terms, stage)
+            terms = terms.map(Tensor.detach)  # frees the autograd graph
         # The only synchronisation with the device in a step; all other work is queued.
         self._verdict(numbers.tolist(), terms)
         if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
@@ -290,31 +299,40 @@ class SVI:
         sampling, curriculum = rates["scheduled_sampling"], rates.get("curriculum")
         constant = {"scheduled_sampling": sampling} if sampling in (0.0, 1.0) else {}
         constant |= {} if curriculum is None else {"curriculum": curriculum}
-        self._recorded = stage, constant, list(weights)
         numbers = [rates["learning_rate"], sampling, *weights.values()]
         inputs = {"numbers": torch.tensor(numbers, dtype=torch.float64), **batch.leaves()}
+        before = dict(self.random)
         with self.drawing():
             kind = stage_at(self.plan, self.state.step)[0], *constant.items()
-            results = self.captured(kind, inputs)
+            function = partial(self._record, stage, constant, list(weights))
+            results = self.captured(kind, function, inputs)
         *verdict, is_invalid = results["numbers"].tolist()
-        if is_invalid:  # the program itself raises the error of its check
-            self._terms(batch, stage.objective, f"step {self.state.step + 1}", sampling, curriculum)
+        if is_invalid:
+            self.random |= before
+            with self.drawing(), torch.no_grad():  # the program itself raises the error of its check
+                self._terms(batch, stage.objective, f"step {self.state.step + 1}", sampling, curriculum)
+            raise RuntimeError("a check of the batch failed only within a CUDA graph; set cuda_graph=False")
         parts: dict[str, dict[str, Tensor]] = {}
         for path, value in results.items():
             part, _, name = path.partition("/")
             parts.setdefault(part, {})[name] = value
         for name, parameter in self.model.named_parameters():
             parameter.grad = parts["gradient"].get(name)
-        tables = {field: {name: value.clone() for name, value in parts.get(field, {}).items()} for field in _TABLES}
-        terms = Terms(**tables, n_steps=results["n_steps"].clone())
+        tables = {table: parts.get(table, {}) for table in _TABLES}
+        terms = Terms(**tables, n_steps=results["n_steps"]).map(torch.clone)
         self._verdict(verdict, terms)
         self._adapt(parts.get("measured", {}))
         return terms
 
-    def _record(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _record(
+        self, stage: Stage, constant: Mapping[str, float], names: Sequence[str], inputs: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         """Take a step without reading a value of the GPU; a step whose loss or gradient is not finite changes nothing.
 
         Args:
+            stage: stage of the step.
+            constant: probability of scheduled sampling and curriculum, if they do not vary.
+            names: names of the objective's weights.
             inputs: "numbers" (2 + W,): learning rate, probability of scheduled sampling and weights of the objective;
                 and the tensors of the batch by path.
 
@@ -322,9 +340,8 @@ class SVI:
             "numbers" (4,) as from `_differentiate`, and whether a check of the batch failed; terms, gradients and
             measured quantities by path.
         """
-        assert self._recorded is not None
         assert isinstance(self.objective, WeightedObjective)
-        stage, constant, names = self._recorded
+        buffers = [(buffer, buffer.clone()) for buffer in self.model.buffers()]
         numbers, objective = inputs["numbers"], self.objective
         sampling = constant.get("scheduled_sampling", numbers[1])
         batch = Batch.from_leaves({path: value for path, value in inputs.items() if path != "numbers"})
@@ -336,19 +353,22 @@ class SVI:
         is_invalid = any_failed(checks, verdict.device)
         is_refused = is_invalid | ~torch.isfinite(verdict[2])
         if self.training.gradient_clip is not None:
-            torch._foreach_mul_(gradients, (self.training.gradient_clip / verdict[1]).clamp(max=1))
+            share = (self.training.gradient_clip / verdict[1]).clamp(max=1)
+            torch._foreach_mul_(gradients, torch.where(is_refused, 1.0, share))
+        for buffer, before in buffers:
+            buffer.copy_(torch.where(is_refused, before, buffer))
         optimizer = self.optimizer.optimizer
         optimizer.found_inf = is_refused.float()
-        before = [dict(group) for group in optimizer.param_groups]
+        earlier = [dict(group) for group in optimizer.param_groups]
         try:
             for group in optimizer.param_groups:
                 group["lr"] = numbers[0].float()
                 if "capturable" in group:  # torch asks for it, although fused optimisers do not differ
-                    group["capturable"] = True
+                    group["capturable"] = self.captured is not None and self.captured.recording
             optimizer.step()
         finally:
             del optimizer.found_inf
-            for group, options in zip(optimizer.param_groups, before, strict=True):
+            for group, options in zip(optimizer.param_groups, earlier, strict=True):
                 group.update(options)
         tables = {
             f"{field}/{name}": value.detach() for field in _TABLES for name, value in getattr(terms, field).items()
@@ -544,12 +564,18 @@ class SVI:
         try:
             measure = self.objective.measure if isinstance(self.objective, StatefulObjective) else None
             on_device = self.fabric.to_device(batch)
-            terms, measured = self.module(lambda: on_device, program, measure)  # fabric rounds tensor arguments
+            terms, measured = self.module(lambda: (on_device, program), measure)  # fabric rounds tensor arguments
             return Terms(**terms), measured
         except ValueError as error:
             if not _is_from_distribution(error):
                 raise
             raise NonFiniteError(f"{location}: {error_message(error).partition(chr(10))[0]}") from error
+
+
+def _is_weighted(objective: object) -> bool:
+    """Return whether an objective's `loss` at its `weights` is what the objective returns."""
+    defining = {name: cls for cls in reversed(type(objective).__mro__) for name in vars(cls)}
+    return isinstance(objective, WeightedObjective) and issubclass(defining["loss"], defining["__call__"])
 
 
 def _is_from_distribution(error: ValueError) -> bool:
@@ -571,11 +597,11 @@ class _Bound(nn.Module):
 
     def forward(
         self,
-        batch: Callable[[], Batch],
-        program: Mapping[str, Any],
+        arguments: Callable[[], tuple[Batch, Mapping[str, Any]]],
         measure: Callable[[Terms], Mapping[str, Tensor]] | None,
     ) -> tuple[dict[str, Any], Mapping[str, Tensor]]:
-        terms, measured = self.estimator.terms(self.model, batch(), **program), dict[str, Tensor]()
+        batch, program = arguments()
+        terms, measured = self.estimator.terms(self.model, batch, **program), dict[str, Tensor]()
         # measured here, because outside only fabric may compute gradients of the module's output
         if measure is not None and torch.is_grad_enabled():
             with torch.autocast(terms.n_steps.device.type, enabled=False):

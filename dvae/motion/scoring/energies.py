@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import Function, once_differentiable
 
+from ...capture import is_deferring
 from ...constants import constant
 from ..geometry.angles import AngleLimits, angle_names, cosines
 from ..geometry.skeleton import Skeleton, differences
@@ -63,21 +64,23 @@ def multimodal_best_of_many(samples: Tensor, pseudo: Tensor, valid: Tensor) -> T
     _check(samples, pseudo=(pseudo, (sequences, futures, *frame_shape)), valid=(valid, (sequences, futures)))
     if valid.dtype != torch.bool:
         raise ValueError(f"valid has dtype {valid.dtype}, expected torch.bool")
-    if valid.device.type == "cpu":
-        sequence, future = valid.nonzero(as_tuple=True)
-    else:  # all futures, because finding the valid ones would synchronise with a GPU
+    if is_deferring():  # all futures, because their number is a value of the GPU
         every = torch.arange(valid.numel(), device=valid.device)
         sequence, future = every // valid.shape[1], every % valid.shape[1]
-    counts = valid[sequence, future]
-    truths = pseudo[sequence, future].masked_fill(~counts[:, None, None], 0)
+        pseudo = pseudo.masked_fill(~valid[..., None, None], 0)
+    else:
+        sequence, future = valid.nonzero(as_tuple=True)
+    truths = pseudo[sequence, future]
     with torch.no_grad():  # ||x - y||^2 - ||y||^2 = ||x||^2 - 2 x y, relative to one sample to avoid cancellation
         offsets = (samples - samples[:1]).transpose(0, 1).flatten(2)
         targets = (pseudo - samples[0, :, None]).masked_fill(~valid[..., None, None], 0).flatten(2)
         distances = offsets.square().sum(2)[:, None] - 2 * targets @ offsets.mT
         best = distances[sequence, future].argmin(1)
-    errors = (_select(samples, best, sequence) - truths).square().sum((1, 2)) * counts
-    sums = errors.new_zeros(sequences).index_add(0, sequence, errors)
-    return sums * (sequences / valid.sum().clamp(min=1).to(sums))
+    errors = (_select(samples, best, sequence) - truths).square().sum((1, 2))
+    if is_deferring():
+        weights = valid.flatten().float() * (sequences / valid.sum().clamp(min=1))
+        return errors.new_zeros(sequences).index_add(0, sequence, errors * weights.to(errors))
+    return errors.new_zeros(sequences).index_add(0, sequence, errors) * (sequences / max(len(sequence), 1))
 
 
 def _errors(samples: Tensor, truth: Tensor) -> Tensor:
