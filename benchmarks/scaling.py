@@ -64,9 +64,9 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
         del os.environ["TORCHELASTIC_RUN_ID"]
         single_process = start_svi(name)
     two_processes, exchange_time, average = start_svi(name), [0.0], processes.average_gradients
-    fabric, x, go_on = two_processes.fabric, torch.randn(METHODS[name], FRAMES, SIZE), torch.zeros(2, dtype=torch.int)
+    fabric, x = two_processes.fabric, torch.randn(METHODS[name], FRAMES, SIZE)
 
-    def timed(*arguments: object) -> tuple[Tensor, Tensor | float]:
+    def timed(*arguments: object) -> tuple[Tensor, Tensor | float, Tensor]:
         start = time.process_time()
         try:
             return average(*arguments)  # type: ignore[arg-type]
@@ -79,7 +79,6 @@ def worker(name: str, turns: int = 25, steps: int = 4) -> None:
         start, busy = time.perf_counter(), time.process_time()
         for _ in range(steps):
             svi.step(x)
-            svi.total(go_on)  # as `fit` does after each
         busy = time.process_time() - busy
         last = torch.tensor([0.0, 0.0])
         last[fabric.global_rank] = time.perf_counter() - start

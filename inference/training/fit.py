@@ -477,16 +477,20 @@ def _train(
     start = time.process_time() - state.processor_seconds
     model: Any = svi.model
     unchecked = isinstance(model, DynamicalVAE) and like(model).dtype is not torch.float64
+    stop = False
     while state.status == "running":
         batch = source.sample(training.batch_size, svi.generator)
         if unchecked:  # only once, as the check synchronises with the device
             check_scale(batch, {WHOLE, *model.observed})
             unchecked = False
+        svi.flags = bool(signals.received), stop
         svi.step(batch)
         if state.step % training.log_every == 0 or state.step == training.steps:
             report(svi.row())
         call("on_step")
-        stopped = is_stop_requested()
+        stopped, stop = bool(signals.received), state.stop
+        if svi.fabric.world_size > 1:  # the gradients have brought the flags that all processes had before the step
+            stopped, state.stop = svi.any_flags
         due = state.step % training.validate_every == 0 or state.step == training.steps or state.stop
         if due and held_out is not None:
             report(svi.validate(held_out))

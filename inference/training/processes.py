@@ -90,8 +90,8 @@ def sum_over_processes(fabric: "Fabric", value: Tensor) -> Tensor:
 
 
 def average_gradients(
-    fabric: "Fabric", parameters: Sequence[nn.Parameter], loss: Tensor, frames: Tensor
-) -> tuple[Tensor, Tensor | float]:
+    fabric: "Fabric", parameters: Sequence[nn.Parameter], loss: Tensor, frames: Tensor, flags: Sequence[bool] = ()
+) -> tuple[Tensor, Tensor | float, Tensor]:
     """Average gradients over processes, weighted by steps, as for one batch of the sequences of all processes.
 
     A parameter that has no gradient in any process remains without one.
@@ -101,25 +101,27 @@ def average_gradients(
         parameters: trained parameters, after the backward pass.
         loss: loss of this process's batch, a scalar.
         frames: number of steps in this process's batch, a scalar.
+        flags: flags of this process, in the same message, because each message may take a tenth of a step.
 
     Returns:
-        The loss of the joint batch, and this process's share of its steps.
+        The loss of the joint batch, this process's share of its steps, and a number for each flag, above 0 if the flag
+        of any process is set.
     """
     if fabric.world_size == 1:
-        return loss.detach(), 1.0
+        return loss.detach(), 1.0, loss.new_zeros(len(flags))
     has_gradient = [parameter.grad is not None for parameter in parameters]
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-    numbers = torch.tensor([1.0, *has_gradient], device=loss.device)
+    numbers = torch.tensor([1.0, *flags, *has_gradient], device=loss.device)
     message = torch.cat([loss.detach()[None], numbers, *(gradient.flatten() for gradient in gradients)])
     joint = _all_reduce(message.mul_(frames))
     all_frames = joint[1].clone()
-    total_loss, _, counts, *means = joint.div_(all_frames).split(
-        [1, 1, len(has_gradient), *(p.numel() for p in parameters)]
+    total_loss, _, any_flags, counts, *means = joint.div_(all_frames).split(
+        [1, 1, len(flags), len(has_gradient), *(p.numel() for p in parameters)]
     )
     has_any_gradient = has_gradient if all(has_gradient) else (counts > 0).tolist()
     for parameter, mean, has_any in zip(parameters, means, has_any_gradient, strict=True):
         parameter.grad = mean.view_as(parameter).to(parameter.dtype) if has_any else None
-    return total_loss[0], frames / all_frames
+    return total_loss[0], frames / all_frames, any_flags
 
 
 def broadcast_values(fabric: "Fabric", values: Iterable[Tensor]) -> None:

@@ -52,7 +52,10 @@ class NonFiniteError(FloatingPointError):
 
 @dataclass
 class State:
-    """State of a run. Callbacks of `fit` read it, and set `stop` to end the run after the step."""
+    """State of a run. Callbacks of `fit` read it, and set `stop` to end the run after the step.
+
+    With several processes, the run ends after the next step, which tells the others.
+    """
 
     model: nn.Module
     step: int = 0
@@ -85,6 +88,10 @@ class SVI:
         stages: consecutive stages with their own objectives, instead of `objective`, for all steps of the run.
         **options: fields of `Training`. Schedules and a decay end by `steps`; the caller decides when to log, validate
             and stop.
+
+    Attributes:
+        flags: whether this process is interrupted, and whether it is to stop; the next step sends them to the others.
+        any_flags: whether these flags of any process were set in the last step.
 
     Raises:
         TypeError, ValueError: when an option does not exist or is out of range, or the model has no trained parameters.
@@ -134,6 +141,7 @@ class SVI:
                 stage.objective.begin(model)  # raises now rather than when its stage begins
         self.parameters = list(trained.values())
         self.final_feeding = self.rates(self.training.steps - 1)["scheduled_sampling"]
+        self.flags = self.any_flags = (False, False)
         self._state: State | None = None
         self._stage_objective: dict[int, Objective] = {}
 
@@ -244,7 +252,9 @@ class SVI:
             gradients, numbers = self._differentiate(objective(terms, step), terms, stage)
             terms = terms.map(Tensor.detach)  # frees the autograd graph
         # The only synchronisation with the device in a step; all other work is queued.
-        self._verdict(numbers.tolist(), terms)
+        *verdict, interrupted, stopped = numbers.tolist()
+        self.any_flags = interrupted > 0, stopped > 0
+        self._verdict(verdict, terms)
         if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
             for gradient in gradients:
                 gradient.mul_(training.gradient_clip / numbers[1])
@@ -265,18 +275,20 @@ class SVI:
         """Compute the gradients of the loss, averaged over the processes.
 
         Returns:
-            Gradients of the parameters that are trained in the stage, and (3,) loss, norm of the gradient, and a number
-            that is finite if both are in all processes.
+            Gradients of the parameters that are trained in the stage, and five numbers: loss, norm of the gradient, a
+            number that is finite if both are in all processes, and for each flag one above 0 if it is set anywhere.
         """
         self.optimizer.zero_grad()
         self.fabric.backward(loss)
         for name, parameter in self.model.named_parameters() if stage.frozen else ():
             if name.startswith(stage.frozen):
                 parameter.grad = None  # the optimiser skips a parameter without a gradient, and keeps its state
-        total_loss, self._share = processes.average_gradients(self.fabric, self.parameters, loss, terms.n_steps.sum())
+        total_loss, self._share, any_flags = processes.average_gradients(
+            self.fabric, self.parameters, loss, terms.n_steps.sum(), self.flags
+        )
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
-        return gradients, torch.stack([loss.detach(), norm, total_loss + norm])
+        return gradients, torch.cat([torch.stack([loss.detach(), norm, total_loss + norm]), any_flags])
 
     def _verdict(self, numbers: list[float], terms: Terms) -> None:
         """Store loss and norm of the gradient, and raise `NonFiniteError` if the loss or a gradient is not finite."""
@@ -306,7 +318,7 @@ class SVI:
             kind = stage_at(self.plan, self.state.step)[0], *constant.items()
             function = partial(self._record, stage, constant, list(weights))
             results = self.captured(kind, function, inputs)
-        *verdict, is_invalid = results["numbers"].tolist()
+        *verdict, _, _, is_invalid = results["numbers"].tolist()
         if is_invalid:
             self.random |= before
             with self.drawing(), torch.no_grad():  # the program itself raises the error of its check
@@ -337,7 +349,7 @@ class SVI:
                 and the tensors of the batch by path.
 
         Returns:
-            "numbers" (4,) as from `_differentiate`, and whether a check of the batch failed; terms, gradients and
+            "numbers" (6,) as from `_differentiate`, and whether a check of the batch failed; terms, gradients and
             measured quantities by path.
         """
         assert isinstance(self.objective, WeightedObjective)

@@ -69,10 +69,10 @@ def some_gradients(rank, out):
     parameters = [torch.nn.Parameter(torch.ones(2)) for _ in range(3)]
     parameters[0].grad = torch.full((2,), 1.0 + rank)
     parameters[1].grad = torch.ones(2) if rank else None
-    loss, share = average_gradients(
-        launch(Training()), parameters, torch.tensor(2.0 - rank), torch.tensor(1.0 + 2 * rank)
+    loss, share, flags = average_gradients(
+        launch(Training()), parameters, torch.tensor(2.0 - rank), torch.tensor(1.0 + 2 * rank), (bool(rank), False)
     )
-    return [p.grad for p in parameters], loss, share
+    return [p.grad for p in parameters], loss, share, (flags > 0).tolist()
 
 
 def whole(rank, out):
@@ -159,11 +159,12 @@ def test_processes_equal_one_process_with_all_batches(of_two):
 
 
 def test_a_parameter_without_a_gradient_in_every_process_has_none(of_two):
-    for rank, ((both, one, none), loss, share) in enumerate(of_two[0]("some_gradients")):
+    for rank, ((both, one, none), loss, share, flags) in enumerate(of_two[0]("some_gradients")):
         assert none is None
         torch.testing.assert_close(both, torch.full((2,), (1 + 3 * 2) / 4))
         torch.testing.assert_close(one, torch.full((2,), 3 / 4))
         assert (float(loss), float(share)) == ((2 + 3 * 1) / 4, (1 + 2 * rank) / 4)
+        assert flags == [True, False]
 
 
 def test_processes_draw_differently_and_keep_equal_weights(of_two):
@@ -183,7 +184,9 @@ def test_a_killed_process_stops_the_others_and_loses_only_steps_since_the_checkp
 
 
 def test_a_stop_request_to_one_process_stops_all(of_two):
-    assert [result["how"] for result in of_two[0]("stopped")] == [("stopped early", 6)] * 2
+    assert [result["how"] for result in of_two[0]("stopped")] == [
+        ("stopped early", 7)
+    ] * 2  # the flag is in the message of the next step
 
 
 def test_random_streams_differ_by_process_and_seed():
