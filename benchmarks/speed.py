@@ -32,6 +32,7 @@ from torch.utils._pytree import tree_leaves
 
 import dvae
 from dvae import motion
+from dvae.data.batch import Batch
 from dvae.distributions import scan
 from dvae.distributions.chain import gaussian_chain
 from dvae.distributions.kalman import LinearGaussianChain
@@ -90,7 +91,7 @@ def stopwatch() -> Callable[[], float]:
 
 def to_device(batch: Any, device: torch.device) -> Any:
     """Move a batch to a device."""
-    return batch.map(lambda value: value.to(device))
+    return Batch(batch).map(lambda value: value.to(device))
 
 
 def layers(model: nn.Module, x: Tensor) -> Callable[[], None]:
