@@ -78,7 +78,7 @@ coverage: venv
 	$(BIN)/pytest -n 2 --cov --cov-report=term-missing:skip-covered --cov-fail-under=97
 
 gpu: venv
-	$(BIN)/pytest -n 4 -k "gpu or kernel"
+	TRITON_DEFAULT_FP_FUSION=1 $(BIN)/pytest -n 4 -k "gpu or kernel"
 	$(BIN)/python -m benchmarks.bench graphs speed --device cuda --keep
 
 DEVICE := cpu

@@ -340,8 +340,8 @@ def _cast(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Tensor:
     if not defer(imprecise.any()) and imprecise.any():
         coordinate = int(imprecise.nonzero()[0])
         raise ValueError(
-            f"coordinate {coordinate} of {name} has mean {mean[coordinate]:.9g} and standard deviation "
-            f"{spread[coordinate]:.3g}, which float32 does not resolve; call "
+            f"coordinate {coordinate} of {name} has mean {mean[coordinate].item():.9g} and standard deviation "
+            f"{spread[coordinate].item():.3g}, which float32 does not resolve; call "
             f"model.standardise({name!r}).fit(values), which subtracts the mean in float64, or subtract it yourself"
         )
     return value.to(dtype)

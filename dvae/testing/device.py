@@ -194,7 +194,7 @@ class Tape:
         return result
 
     def end(self, random_state: Tensor) -> None:
-        """Undo the changes of a recording, in which a GPU computes nothing."""
+        """Undo the changes of a recording, because a GPU computes nothing while it records."""
         torch.set_rng_state(random_state)
         for whole, values in self._changed.values():
             whole.copy_(values)

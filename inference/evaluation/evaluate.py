@@ -12,6 +12,7 @@ one cluster overlap, so standard errors are clustered and `Evaluation.difference
 """
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from reprlib import repr as brief
@@ -328,6 +329,8 @@ def forecaster_of(
         futures: Tensor = model.forecast(on_device_of(model, windows.past(part)), horizon, samples, **options)["x"]
         return futures
 
+    if cuda_graph and device.type != "cuda":
+        warnings.warn(f"forecasts run without a CUDA graph: the device is {device.type}, not cuda", stacklevel=3)
     if not cuda_graph or device.type != "cuda":
         return forecast
     captured = Captured("a forecast", device)

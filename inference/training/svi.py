@@ -203,7 +203,7 @@ class SVI:
         if not self.training.cuda_graph:
             return
         kind, optimizer = self.fabric.device.type, self.optimizer.optimizer
-        obstacles = [] if kind == "cuda" else [f"the device is a {kind}"]
+        obstacles = [] if kind == "cuda" else [f"the device is {kind}, not cuda"]
         obstacles += ["processes exchange their gradients"] if self.fabric.world_size > 1 else []
         for objective in {id(stage.objective): stage.objective for stage in self.plan}.values():
             begun = objective.begin(self.model) if isinstance(objective, AdaptiveObjective) else objective
@@ -585,7 +585,7 @@ class SVI:
 
 
 def _is_weighted(objective: object) -> bool:
-    """Return whether an objective's `loss` at its `weights` is what the objective returns."""
+    """Return whether `loss` at `weights` gives the value of the objective itself."""
     defining = {name: cls for cls in reversed(type(objective).__mro__) for name in vars(cls)}
     return isinstance(objective, WeightedObjective) and issubclass(defining["loss"], defining["__call__"])
 

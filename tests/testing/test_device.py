@@ -277,7 +277,7 @@ def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
     for simulated in (False, True):
         model, recipe, _, _ = small_method(name, count)
         options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False}
-        options["learning_rate"] = 2**-10  # exact in float32, in which graphs read it
+        options["learning_rate"] = 2**-10  # graphs read it in float32, which represents it exactly
         with simulated_gpu() if simulated else nullcontext():
             model = move(model.double()) if simulated else model.double()
             svi = dvae.SVI(model, stages=recipe.stages, cuda_graph=simulated, **options)
@@ -303,7 +303,7 @@ def test_replayed_steps_on_a_gpu_equal_steps_without_graphs(name, small_method):
     for cuda_graph in (False, True):
         model, recipe, _, _ = small_method(name, count)
         options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False, "accelerator": "cuda"}
-        options["learning_rate"] = 2**-10  # exact in float32, in which graphs read it
+        options["learning_rate"] = 2**-10  # graphs read it in float32, which represents it exactly
         svi = dvae.SVI(model.double(), stages=recipe.stages, cuda_graph=cuda_graph, **options)
         svi.init()
         runs.append((steps_of(svi, recipe, count), svi.random))
@@ -464,14 +464,70 @@ class TestCapturedStep:
             restore(svi, run)
             assert [(svi.step(batch), svi.row()["loss"])[1] for batch in batches[5:]] == pytest.approx(expected, 1e-9)
 
+    def test_batches_with_gaps_are_replayed(self):
+        """Within a graph, each mask counts as incomplete, since reading it would synchronise."""
+        masks = torch.rand(10, 4, 5, 3, generator=torch.Generator().manual_seed(2)) < 0.7
+        batches, runs = [{"x": x, "mask": mask} for x, mask in zip(self.batches(), masks, strict=True)], []
+        for cuda_graph in (False, True):
+            with simulated_gpu() if cuda_graph else nullcontext():
+                svi = self.svi(cuda_graph)
+                losses = [(svi.step(batch), svi.row()["loss"])[1] for batch in batches]
+                runs.append((losses, self.weights(svi)))
+        assert len(svi.captured.graphs) == 1
+        assert runs[1][0] == pytest.approx(runs[0][0], 1e-6)
+        torch.testing.assert_close(runs[1][1], runs[0][1], rtol=1e-6, atol=1e-6)
+
+    def test_latents_of_groups_are_replayed(self):
+        batches, runs = self.batches(), []
+        groups = torch.tensor([[0, 0, 1, 1], [2, 1, 2, 2], [3, 3, 3, 3], [0, 1, 2, 3], [5, 4, 4, 5]]).repeat(2, 1)
+        for cuda_graph in (False, True):
+            with simulated_gpu() if cuda_graph else nullcontext():
+                torch.manual_seed(0)
+                model = dvae.DynamicalVAE(
+                    "p(g) p(z_t | z_{t-1}, g) p(x_t | z_t)",
+                    "q(g | x_{1:T}) q(z_t | z_{t-1}, x_t, g)",
+                    {"g": 2, "z": 2, "x": 3},
+                    grouped=("g",),
+                ).double()
+                svi = dvae.SVI(move(model) if cuda_graph else model, steps=20, progress=False, cuda_graph=cuda_graph)
+                svi.init()
+                pairs = zip(batches, groups, strict=True)
+                losses = [(svi.step({"x": x, "group": group}), svi.row()["loss"])[1] for x, group in pairs]
+                runs.append((losses, self.weights(svi)))
+        assert len(svi.captured.graphs) == 1
+        assert runs[1][0] == pytest.approx(runs[0][0], 1e-6)
+        torch.testing.assert_close(runs[1][1], runs[0][1], rtol=1e-6, atol=1e-6)
+
+    def test_values_that_float32_does_not_resolve_are_refused(self):
+        """A float32 model checks float64 values, also within a graph."""
+        batches = self.batches()
+        with simulated_gpu():
+            torch.manual_seed(0)
+            model = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 2, "x": 3})
+            svi = dvae.SVI(move(model), steps=20, progress=False, cuda_graph=True)
+            svi.init()
+            for batch in batches:
+                svi.step(batch)
+            assert len(svi.captured.graphs) == 1
+            before = self.weights(svi)
+            with pytest.raises(ValueError, match="which float32 does not resolve"):
+                svi.step(1e9 + batches[0])
+            torch.testing.assert_close(self.weights(svi), before, rtol=0, atol=0)
+
     def test_a_processor_has_no_graphs(self):
         svi = dvae.SVI(torch.nn.Linear(1, 1), cuda_graph=True, accelerator="cpu")
-        with pytest.warns(UserWarning, match="without a CUDA graph: the device is a cpu"):
+        with pytest.warns(UserWarning, match="without a CUDA graph: the device is cpu, not cuda"):
             svi.init()
 
 
 class TestCaptured:
     """The simulated graphs of any function."""
+
+    def test_forecasts_on_a_processor_have_no_graphs(self):
+        model = dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 2})
+        windows = dvae.ArrayWindows(torch.randn(4, 6, 2), observed=3)
+        with pytest.warns(UserWarning, match="forecasts run without a CUDA graph: the device is cpu, not cuda"):
+            dvae.evaluate(model, windows, samples=2, cuda_graph=True, progress=False)
 
     def results(self, function, warning=None, count=6):
         """Return the results of calls with x = 1, 2, …, and the graphs."""
