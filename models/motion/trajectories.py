@@ -284,8 +284,8 @@ class TrajectoryModel(DynamicalVAE):
 
         def futures(part: slice, count: int) -> dict[str, Tensor]:
             inputs, latents = rows(data, part), {}
-            for name in self.latents:  # the prior is evaluated once for all samples
-                loc, scale = self.generator[name](inputs, len(inputs[FIRST]), length)
+            for name in self.latents:  # evaluated once for all samples
+                loc, scale = self._test_time(name)(inputs, len(inputs[FIRST]), length)
                 noise = torch.randn(count, *loc.shape, dtype=loc.dtype, device=loc.device)
                 latents[name] = torch.addcmul(loc, scale, noise, value=temperature).flatten(0, 1)
             program = poutine.condition(self.model, data=latents)
@@ -298,6 +298,11 @@ class TrajectoryModel(DynamicalVAE):
             out = in_chunks(futures, len(data[FIRST]), distinct, chunk)
         # Equal samples are copies of one, because rows of one matrix product may differ in their last bits.
         return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
+
+    def _test_time(self, name: str) -> Any:
+        """Return the distribution of a latent in forecasts: the guide if it reads only s and y, otherwise the prior."""
+        is_given = {parent.name for parent in self.inference.factor(name).parents} <= {FIRST, GIVEN}
+        return (self.encoder if is_given else self.generator)[name]
 
     def _extend_paths(self, data: Batch, horizon: int) -> Batch:
         """Return the data with trajectories over all frames that the networks predict for a horizon.
@@ -476,7 +481,7 @@ class TrajectoryModel(DynamicalVAE):
 
         with self.running():
             with torch.no_grad():
-                scale = self.generator[self.latents[0]](data, 1, len(known_mask))[1]
+                scale = self._test_time(self.latents[0])(data, 1, len(known_mask))[1]
             x, corrections = follow_paths(
                 means, latents, scale, data[GIVEN][0], known_mask, self.skeleton, bones, **options
             )

@@ -10,11 +10,16 @@ cumulative sum of offsets over time. The loss is
     sum_t |x_t - mean_t|^2 + .01 KL(q | p)
 
 Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351, with the layers of its public implementation. Prior and guide
-share the perceptrons of poses and two of three transformers; the decoder shares the perceptron of s. Two choices are
-ours. Scales of z use softplus, whereas the public implementation has log-variances. If the learned prior is switched
-off, on which the paper gives little detail, the decoder reads z and the trajectories frame by frame. On other data
-than the paper's, the defaults are small networks, few coefficients, a smaller weight of the KL, and windows rotated to
-one heading (docs/results/trajevae.md).
+share the perceptrons of poses and two of three transformers; the decoder shares the perceptron of s. Scales of z use
+softplus, whereas the public implementation has log-variances. On other data than the paper's, the defaults are small
+networks, few coefficients, a smaller weight of the KL, and windows rotated to one heading (docs/results/trajevae.md).
+
+The paper's ablation without the learned prior ("Base") is, in the public implementation,
+
+    p(z_k) p(x_t | z_{1:T}, s)        q(z_k | y_{1:T}, s)
+
+The guide reads only what is given at test time, and forecasts draw z from it (`prior="base"`). With
+`prior="standard"`, which is ours, forecasts draw z from N(0, I), and the decoder reads the trajectories frame by frame.
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import sqrt
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -46,6 +51,14 @@ PRESETS = table(
 )
 """Options by skeleton: the paper's values; for other skeletons, values that train in minutes on a CPU."""
 
+LEARNED = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)", "q(z_t | r_{1:T}, s)"
+EQUATIONS = {
+    "learned": LEARNED,
+    "base": ("p(z_t) p(x_t | z_{1:T}, s)", "q(z_t | y_{1:T}, s)"),
+    "standard": ("p(z_t) p(x_t | z_{1:T}, y_{1:T}, s)", LEARNED[1]),
+}
+"""Generative and inference factorization by prior."""
+
 
 @dataclass(frozen=True)
 class TrajeVAE(LatentTrajectoryMethod):
@@ -59,15 +72,14 @@ class TrajeVAE(LatentTrajectoryMethod):
         heads_count: number of attention heads.
         layers: layers of each transformer.
         dropout: share of units dropped in training.
-        learned_prior: whether to learn the prior p(z_t | y_{1:T}, s); otherwise p(z) = N(0, I), and the decoder reads
-            the trajectories y.
+        prior: "learned" for p(z_t | y_{1:T}, s); "base" for N(0, I), with a guide of y and s that also generates
+            forecasts; "standard" for N(0, I), with a decoder that reads y.
         cosine: whether to use the cosine transform; otherwise z has one value for each frame.
     """
 
     name = "trajevae"
     source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
-    generative = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)"
-    inference = "q(z_t | r_{1:T}, s)"
+    generative, inference = LEARNED
 
     presets = PRESETS
 
@@ -77,7 +89,7 @@ class TrajeVAE(LatentTrajectoryMethod):
     heads_count: Size = 4
     layers: Layers | None = None
     dropout: Annotated[float, Range(0, 1, below=True)] | None = None
-    learned_prior: bool = True
+    prior: Literal["learned", "base", "standard"] = "learned"
     cosine: bool = True
 
     def __post_init__(self) -> None:
@@ -99,14 +111,12 @@ class TrajeVAE(LatentTrajectoryMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        p = self.generative
-        if not self.learned_prior:
-            p = "p(z_t) p(x_t | z_{1:T}, y_{1:T}, s)"
+        p, q = EQUATIONS[self.prior]
         masks = {}
         if self.components:
             p = p.replace("z_{1:T}", "z_{1:C}")
             masks = {"1:C": partial(_slow, components=self.components)}
-        return Factorization.parse(p, masks), Factorization.parse(self.inference)
+        return Factorization.parse(p, masks), Factorization.parse(q)
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
@@ -115,7 +125,7 @@ class TrajeVAE(LatentTrajectoryMethod):
         shape: dict[str, Any] = {"heads": self.heads_count, **{name: getattr(self, name) for name in shared}}
         encoder = CosineEncoder(**shape)
         networks: dict[str, NetworkSpec] = {"q(z)": encoder}
-        if self.learned_prior:
+        if self.prior == "learned":
             networks["p(z)"] = encoder
         return {**networks, "p(x)": CosineDecoder(hidden=2 * shape["width"], **shape)}
 
@@ -124,14 +134,14 @@ class TrajeVAE(LatentTrajectoryMethod):
         """Return a normal distribution of poses and normal latents; no factor reads latents beyond `components`."""
         latent: DistributionSpec = SlowNormal(steps=self.components) if self.components else Normal()
         emission = FixedNormal(scale=sqrt(0.5), project=False, error_weight=True)
-        return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.learned_prior else {})}
+        return {"p(x)": emission, "q(z)": latent, **({"p(z)": latent} if self.prior == "learned" else {})}
 
     @override
     def _build_model(self, kind: Any, size: int, *arguments: Any) -> Any:
         model = super()._build_model(kind, size, *arguments)
         guide, decoder = model.encoder["z"].network, model.generator["x"].network
         share_modules([guide, decoder], "static")
-        if self.learned_prior:
+        if self.prior == "learned":
             share_modules([guide, model.generator["z"].network], "over_time", "static", "before", "between")
         return model
 

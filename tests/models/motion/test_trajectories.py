@@ -83,6 +83,16 @@ class TestTrajeVAEWithFewerComponents(OfOneLength):
         pass
 
 
+class TestTrajeVAEWithTheBasePrior(OfOneLength):
+    name = "trajevae"
+    options: ClassVar = {"prior": "base"}
+
+
+class TestTrajeVAEWithTheStandardPrior(OfOneLength):
+    name = "trajevae"
+    options: ClassVar = {"prior": "standard"}
+
+
 class TestCVAERNN(OfOneLength):
     name = "cvae-rnn"
 
@@ -121,6 +131,53 @@ def test_the_loss_adds_squared_errors_and_the_weighted_kl(windows):
     constant = 0.5 * math.log(math.pi) * windows.size * 20  # normalisation of N(0, 1/2)
     expected = (errors + constant + 0.01 * divergence.sum((1, 2))).sum() / (3 * 20)
     assert loss.item() == pytest.approx(expected.item(), rel=1e-7)  # the scale is float32
+
+
+def wave(speed, *shape):
+    """Return deterministic values between -1 and 1, which are the same on every machine up to rounding."""
+    return torch.sin(speed * torch.arange(1, math.prod(shape) + 1, dtype=torch.float64)).reshape(shape)
+
+
+@pytest.mark.parametrize(("cosine", "published"), [(False, 10_724.433743565914), (True, 10_724.659583683953)])
+def test_the_base_has_the_size_and_the_loss_of_the_public_implementation(cosine, published):
+    """Losses are of github.com/kacperkan/trajevae at eee55c2, with these weights, inputs and noise."""
+    rows, length, joints = 3, 6, 17
+    method = dvae.method("trajevae", prior="base", cosine=cosine)
+    model = method.build_on(HUMAN36M).double().eval()
+    assert sum(parameter.numel() for parameter in model.parameters()) == 14_260_787
+    head, encoder, decoder = model.encoder["z"].head, model.encoder["z"].network, model.generator["x"].network
+    order = [encoder.static, encoder.over_time, encoder.before, encoder.between, encoder.after]
+    parameters = [each for part in [*order, decoder.into, decoder.transformer, decoder.offsets] for each in part.parameters()]
+    location, scale = wave(0.7 + 0.1 * len(parameters), 512, 512), 1 + 0.5 * wave(0.3, 512)
+    offset = wave(0.8 + 0.1 * len(parameters), 512)
+    with torch.no_grad():
+        for index, parameter in enumerate(parameters):
+            values = wave(0.7 + 0.1 * index, *parameter.shape)
+            parameter.copy_(values / math.sqrt(parameter.shape[-1]) if parameter.dim() > 1 else values)
+        head.out.weight.copy_(torch.cat([location / math.sqrt(512), torch.zeros(512, 512)]))
+        head.out.bias.copy_(torch.cat([offset, torch.expm1(scale - head.min_scale).log()]))
+    head.draw = lambda given, noise: given[0] + given[1] * wave(1.3, rows, length, 512)
+    x = wave(0.9, rows, 1 + length, joints, 3)
+    given = (wave(2.1, rows, 1, joints, 1) > 0.2) * x
+    terms = dvae.SequenceELBO().terms(model, {"x": x.flatten(2), "y": given.flatten(2)})
+    constant = 0.5 * math.log(math.pi) * 3 * joints * length  # normalisation of N(0, 1/2)
+    kl_weight = method.with_presets(method.preset(HUMAN36M)).beta
+    loss = kl_weight * terms.kl["z"] - terms.log_likelihood["x"] - constant
+    assert loss.mean().item() == pytest.approx(published, rel=1e-6)  # the scale 1/sqrt(2) is float32
+
+
+def test_forecasts_of_the_base_draw_latents_from_its_guide(windows):
+    model = build(windows, prior="base", components=3)
+    batch = double(windows.given(["LWrist"]).all())
+    x, y = batch["x"][:2], batch["y"][:2]
+    data = {"s": x[:, 0], "y": y[:, 1:]}
+    loc, scale = model.encoder["z"](data, 2, 20)
+    still = model.forecast({"x": x[:, :1], "y": y}, 20, temperature=0.0)
+    torch.testing.assert_close(still["z"][0], loc)
+    torch.testing.assert_close(still["x"][0], model.generator["x"]({"z": loc, "s": data["s"]}, 2, 20)[0])
+    torch.manual_seed(0)
+    z = model.forecast({"x": x[:, :1], "y": y}, 20, samples=400)["z"]
+    assert ((z.mean(0) - loc).abs() < 6 * scale / 20).all()
 
 
 @pytest.mark.parametrize(
