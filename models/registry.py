@@ -32,6 +32,7 @@ METHODS = {
     "kvae": "dvae.models.family.kvae:KVAE",
     "autoregressive": "dvae.models.family.autoregressive:Autoregressive",
     "moglow": "dvae.models.baselines.moglow:MoGlow",
+    "moglow-paths": "dvae.models.baselines.moglow_paths:MoGlowPaths",
     "erd": "dvae.models.baselines.erd:ERD",
     "aclstm": "dvae.models.baselines.aclstm:ACLSTM",
     "hit-dvae": "dvae.models.motion.hit_dvae:HiTDVAE",

@@ -100,6 +100,7 @@ class Paper:
         printed: rows of the paper.
         views: views of all rows; each number of given paths has its own line.
         further: views of some rows.
+        large: rows that take days on a CPU; they are fitted on a GPU only, or if they are named.
     """
 
     set: str
@@ -110,6 +111,7 @@ class Paper:
     printed: Mapping[str, Mapping[str, str]]
     views: Sequence[View] = (View(),)
     further: Sequence[Further] = ()
+    large: Sequence[str] = ()
 
     def views_of(self, row: str) -> list[View]:
         """Return all views of a row."""
@@ -271,7 +273,8 @@ def main(
     for name in papers:
         paper = PAPERS[name]
         if data is not None:
-            selected = {row: options for row, options in paper.rows.items() if not rows or row in rows}
+            default = [row for row in paper.rows if accelerator == "cuda" or row not in paper.large]
+            selected = {row: options for row, options in paper.rows.items() if row in (rows or default)}
             views = {row: paper.views_of(row) for row in selected}
             work(data, runs, stored, paper.set, selected, views, seeds, samples, accelerator)
         rows_by_view = {view: entries(stored, paper.set, view, paper.rows) for view in paper.views}

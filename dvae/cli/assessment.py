@@ -29,7 +29,7 @@ MOST_REMEMBERED = 2**32
 
 @dataclass(frozen=True)
 class Control:
-    """Paths given to methods that take trajectories (trajevae, cvae-rnn, motion-infilling).
+    """Paths given to methods that take trajectories (trajevae, cvae-rnn, moglow-paths, motion-infilling).
 
     Args:
         joints: joints whose paths are given to the runs.

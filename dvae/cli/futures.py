@@ -35,7 +35,7 @@ EMISSIONS = {"drawn": "draws of the emission", "mean": "means of the emission", 
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths to follow, for methods that take trajectories (trajevae, cvae-rnn, motion-infilling).
+    """Paths to follow, for methods that take trajectories (trajevae, cvae-rnn, moglow-paths, motion-infilling).
 
     Args:
         joints: joints that follow their true paths in the window.

@@ -138,15 +138,11 @@ class MoGlow(LikelihoodMethod):
 
 
 def start_flow(model: DynamicalVAE, windows: Any) -> None:
-    """Fit the unit of x to 256 windows, and initialise flows with them (`ConditionalFlowModule.start_at`)."""
-    batch, units, distribution = (
-        windows.sample(256, torch.default_generator),
-        model.units[WHOLE],
-        model.generator[WHOLE].head,
-    )
-    if not units.scale.dim():  # units of columns are known
+    """Fit the unit of x, if it has one, to 256 windows; initialise flows with them (`ConditionalFlowModule.start_at`)."""
+    batch, distribution = windows.sample(256, torch.default_generator), model.generator[WHOLE].head
+    if WHOLE in model.units and not model.units[WHOLE].scale.dim():  # units of columns are known
         exact = model.read(batch, precise=True)
-        units.fit(interpolate_missing(exact[WHOLE], exact.mask()))
+        model.units[WHOLE].fit(interpolate_missing(exact[WHOLE], exact.mask()))
     data = model.read(batch)
     x = data[WHOLE]
     run = model.rollout(data)

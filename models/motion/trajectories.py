@@ -73,7 +73,7 @@ class TrajectoryMethod(PoseMethod):
         preset = super().preset(skeleton)
         return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
-    def extra_inputs(self) -> Paths:
+    def extra_inputs(self) -> View:
         """Return the view (see `dvae.data.views`) that adds joint trajectories and the first pose to each window."""
         return Paths()
 
@@ -149,7 +149,7 @@ class LatentTrajectoryMethod(TrajectoryMethod):
         return {"p(x)": FixedNormal(scale=sqrt(0.5), error_weight=True)}
 
     @override
-    def extra_inputs(self) -> Paths:
+    def extra_inputs(self) -> View:
         return OtherJoints(self.complement)
 
     @override

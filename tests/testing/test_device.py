@@ -37,6 +37,7 @@ SMALL = {
     "aclstm": {"width": 4},
     "autoregressive": {"width": 4},
     "moglow": {"width": 4, "flow_steps": 1},
+    "moglow-paths": {"width": 4, "flow_steps": 1},
     "cvae-rnn": {"latent": 4, "summary": 4, "width": 8, "hidden": (8,)},
     "motion-infilling": {"maps": (4, 6)},
     "mt-vae": {"latent": 4, "width": 8},
@@ -53,7 +54,7 @@ STEP = {
 }
 """Number of synchronisations of each step, by file."""
 BESIDE = {
-    "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of each coupling
+    **dict.fromkeys(("moglow", "moglow-paths"), {"distributions/conditional_flow.py": 2}),  # zuko looks up both halves of each coupling
     "hit-dvae": {"scoring/energies.py": 1},  # the number of admissible futures is a shape
     "gsps": {"scoring/energies.py": 1},
     "mix-and-match": {"program/rollout.py": 1},  # which frames are sampled, so that a loop skips the others
@@ -255,7 +256,7 @@ def test_a_loop_over_time_neither_synchronizes_nor_uploads(loop, option):
 # ------------------------------------------------------------------------------------------------------ CUDA graphs
 
 
-UNCAPTURED = {"moglow": "conditional_flow.py"}
+UNCAPTURED = dict.fromkeys(("moglow", "moglow-paths"), "conditional_flow.py")
 """Methods whose steps run without a graph, and where they read a value of the GPU."""
 
 
