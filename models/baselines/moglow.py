@@ -138,7 +138,7 @@ class MoGlow(LikelihoodMethod):
 
 
 def start_flow(model: DynamicalVAE, windows: Any) -> None:
-    """Fit the unit of x, if it has one, to 256 windows; initialise flows with them (`ConditionalFlowModule.start_at`)."""
+    """Fit the unit of x, if any, to 256 windows, and initialise flows with them (`ConditionalFlowModule.start_at`)."""
     batch, distribution = windows.sample(256, torch.default_generator), model.generator[WHOLE].head
     if WHOLE in model.units and not model.units[WHOLE].scale.dim():  # units of columns are known
         exact = model.read(batch, precise=True)

@@ -54,7 +54,8 @@ STEP = {
 }
 """Number of synchronisations of each step, by file."""
 BESIDE = {
-    **dict.fromkeys(("moglow", "moglow-paths"), {"distributions/conditional_flow.py": 2}),  # zuko looks up both halves of each coupling
+    "moglow": {"distributions/conditional_flow.py": 2},  # zuko looks up both halves of each coupling
+    "moglow-paths": {"distributions/conditional_flow.py": 2},
     "hit-dvae": {"scoring/energies.py": 1},  # the number of admissible futures is a shape
     "gsps": {"scoring/energies.py": 1},
     "mix-and-match": {"program/rollout.py": 1},  # which frames are sampled, so that a loop skips the others

@@ -147,7 +147,9 @@ def test_the_base_has_the_size_and_the_loss_of_the_public_implementation(cosine,
     assert sum(parameter.numel() for parameter in model.parameters()) == 14_260_787
     head, encoder, decoder = model.encoder["z"].head, model.encoder["z"].network, model.generator["x"].network
     order = [encoder.static, encoder.over_time, encoder.before, encoder.between, encoder.after]
-    parameters = [each for part in [*order, decoder.into, decoder.transformer, decoder.offsets] for each in part.parameters()]
+    parameters = [
+        each for part in [*order, decoder.into, decoder.transformer, decoder.offsets] for each in part.parameters()
+    ]
     location, scale = wave(0.7 + 0.1 * len(parameters), 512, 512), 1 + 0.5 * wave(0.3, 512)
     offset = wave(0.8 + 0.1 * len(parameters), 512)
     with torch.no_grad():

@@ -376,7 +376,9 @@ def small(name):
     return data, dvae.method(name, **options).resolve_defaults(data.windows("train"))
 
 
-@pytest.mark.parametrize("name", [name for name in METHODS if name not in ("mix-and-match", "motion-latent", "moglow", "moglow-paths")])
+@pytest.mark.parametrize(
+    "name", [name for name in METHODS if name not in ("mix-and-match", "motion-latent", "moglow", "moglow-paths")]
+)
 def test_every_method_supports_missing_values(name):
     """Fit, validate and score; the values at missing entries change nothing."""
     data, method = small(name)
