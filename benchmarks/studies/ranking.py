@@ -405,11 +405,17 @@ def rows_of(stored: Path, name: str, view: View) -> dict[str, Row]:
 
 EMISSION = 3
 """Position in a basis of the kind of forecasts: means or draws."""
+IDENTITY = "fingerprint", "windows", "given"
+"""Entries that identify the windows of a basis."""
 
 
 def comparable_basis(basis: Sequence[Any]) -> list[Any]:
-    """Return the entries of a basis that the rows of a table must share: all except the kind of forecasts."""
-    return [*basis[:EMISSION], *basis[EMISSION + 1 :]]
+    """Return the entries of a basis that the rows of a table must share: all except the kind of forecasts.
+
+    Of the windows, only entries that identify them count, because versions describe windows with different entries.
+    """
+    windows, *others = basis
+    return [*(windows.get(name) for name in IDENTITY), *others[: EMISSION - 1], *others[EMISSION:]]
 
 
 def row_label(name: str, entry: Row) -> str:
