@@ -20,18 +20,22 @@ With a fixed latent, or a fixed motion of the first parts, these parts are const
 Mao, Liu and Salzmann, 2021, arXiv 2108.08422, with the layers, weights and normalisations of its public code. Our
 addition: the generator may see every window rotated so that the last observed pose faces one way, as in the presets for
 small data sets.
+
+Coefficient k = 0, 1, ... of T frames at f frames per second has the frequency k f / (2 T). For Human3.6M, the
+supplement states 20 coefficients (3.8 Hz). The public code has 10 (1.8 Hz), and so has the released model: its
+generator has 1,298,108 parameters. For HumanEva-I, both have 8 (2.8 Hz). Other data have as many as reach 2.8 Hz.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
-from math import prod
+from math import floor, prod
 from operator import mul
 from string import ascii_lowercase
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -46,25 +50,32 @@ from ...factorization.notation import Factorization
 from ...inference.training.objectives import Evidence, Objective
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
-from ...motion import Skeleton, Windows
+from ...motion import HUMAN36M, HUMANEVA, PROTOCOLS, Skeleton, Windows
+from ...motion.data.protocols import Poses
 from ...motion.geometry.parts import body_parts
 from ...motion.scoring import energies
 from ...networks import GraphConv
-from ...options import Amount, Layers, Size
+from ...options import Amount, Layers, Positive, Size
 from ...program.batch import AnyBatch
 from ...program.rollout import Rollout
 from .energies import EnergyMethod, EnergyModel
 from .poses import table, without_gaps
 
+BANDWIDTH = 2.8
+"""Frequency in Hz that the coefficients reach by default; the paper's on HumanEva-I."""
+PUBLISHED = {"code": {HUMAN36M.name: 10, HUMANEVA.name: 8}, "supplement": {HUMAN36M.name: 20, HUMANEVA.name: 8}}
+"""Numbers of coefficients for each skeleton, in the public code and in the paper's supplement."""
 PRESETS = table(
     "coefficients width draws diversity diversity_scale pseudo_minimum pool_stride heading",
     {
         "human36m": (10, 256, (10, 10), (8.0, 25.0), (100.0, 300.0), 0.1, 20, False),
         "humaneva": (8, 256, (10, 10), (5.0, 10.0), (15.0, 50.0), 0.01, 15, False),
-        "": (8, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
+        "": (None, 128, (4, 4), (5.0, 10.0), (15.0, 50.0), 0.01, 10, True),
     },
 )
 """Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
+CLIP = 100.0
+"""Largest norm of the gradient of the published loss, a sum over frames. Ours is that loss over the T frames."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +91,10 @@ class GSPS(EnergyMethod):
         parts: parts of the body, in the order of their prediction: "lower" and "upper", or some of "torso",
             "right_leg", "left_leg", "left_arm", "right_arm"; or new ones, such as "legs=right_leg+left_leg" or
             "head=Neck+Head".
-        coefficients: number of cosine coefficients of the whole window.
+        coefficients: number of cosine coefficients of the whole window; or "code" or "supplement" for the number in the
+            public code or in the paper's supplement. By default the number in the code, and for skeletons other than
+            Human3.6M's and HumanEva-I's as many as reach `bandwidth`.
+        bandwidth: highest frequency of the coefficients in Hz, in place of their number; 2.8 if neither is given.
         width: features of a joint in the networks.
         blocks: residual blocks of each network.
         draws: number of draws of each part's latent, in training, for each draw of the earlier parts.
@@ -93,13 +107,14 @@ class GSPS(EnergyMethod):
     inference = "q(a) q(b)"
     presets = PRESETS
     trainings: ClassVar[Mapping[str, Training]] = {
-        "human36m": Training(156_000, 16, 1e-3, 0.8, gradient_clip=100.0),
-        "humaneva": Training(62_500, 16, 1e-3, 0.8, gradient_clip=100.0),
+        "human36m": Training(156_000, 16, 1e-3, 0.8, gradient_clip=CLIP / PROTOCOLS["h36m"].length),
+        "humaneva": Training(62_500, 16, 1e-3, 0.8, gradient_clip=CLIP / PROTOCOLS["humaneva"].length),
         "": Training(6500, 16, 1e-3, 0.5),
     }
     latent: Size = 64
     parts: tuple[str, ...] = ("lower", "upper")
-    coefficients: Size | None = None
+    coefficients: Size | Literal["code", "supplement"] | None = None
+    bandwidth: Positive | None = None
     width: Size | None = None
     blocks: Layers = 4
     draws: tuple[Size, ...] | None = None
@@ -114,6 +129,10 @@ class GSPS(EnergyMethod):
         super().__post_init__()
         if not self.parts:
             raise ValueError("parts is empty; name at least one part of the body")
+        if self.coefficients is not None and self.bandwidth is not None:
+            raise ValueError(
+                f"coefficients is {self.coefficients} and bandwidth is {self.bandwidth:g}; give only one of them"
+            )
         for name in ("draws", "diversity", "diversity_scale"):
             values = getattr(self, name)
             if values is not None and len(values) not in (1, len(self.parts)):
@@ -153,6 +172,31 @@ class GSPS(EnergyMethod):
         if name == "draws":
             return (max(2, int(prod(value) ** (1 / count))),) * count
         return (sum(value) / count,) * count
+
+    @override
+    def resolve_defaults(self, data: Any) -> Self:
+        """Return the method with unset options chosen for the skeleton, and the number of coefficients.
+
+        Raises:
+            ValueError: if `coefficients` names a publication that has no number for the skeleton.
+        """
+        schema = Poses.of(data, self.name, self.representation)
+        method = replace(self, coefficients=self._count(schema), bandwidth=None)
+        return super(GSPS, method).resolve_defaults(schema)
+
+    def _count(self, schema: Poses) -> int:
+        """Return the number of coefficients for windows of poses."""
+        count, bandwidth, skeleton = self.coefficients, self.bandwidth, schema.skeleton.name
+        if isinstance(count, str):
+            if skeleton not in PUBLISHED[count]:
+                raise ValueError(
+                    f"coefficients is {count!r}, which has numbers for {' and '.join(PUBLISHED[count])}, not for the "
+                    f"skeleton {skeleton!r}; give a number, or a bandwidth in Hz"
+                )
+            return PUBLISHED[count][skeleton]
+        if count is None and bandwidth is None:
+            count, bandwidth = self.preset(schema.skeleton)["coefficients"], BANDWIDTH
+        return count or coefficients_up_to(bandwidth, schema.frames, schema.protocol.fps)
 
     @override
     def build(self, data: Any) -> GSPSModel:
@@ -353,6 +397,17 @@ class GSPSModel(EnergyModel):
     def sample(self, n: int = 1, length: int | None = None, batch: AnyBatch | None = None) -> dict[str, Tensor]:
         """Draw futures of the observed motion in the batch."""
         return super().sample(n, self.length if length is None else length, batch)
+
+
+def coefficients_up_to(frequency: float, frames: int, fps: float) -> int:
+    """Return the number of cosine coefficients whose frequencies do not exceed a given one; at most all.
+
+    Args:
+        frequency: highest frequency in Hz.
+        frames: T, number of frames that the coefficients describe.
+        fps: frames per second.
+    """
+    return min(1 + floor(2 * frames * frequency / fps + 1e-9), frames)  # 1e-9: exact multiples, despite rounding
 
 
 def part_by_part(parts: Sequence[str], observed: Callable[[int], int]) -> Factorization:

@@ -1,5 +1,6 @@
 """GSPS: its factorization, energies, control of parts, forecasts and runs."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -11,6 +12,7 @@ from dvae import motion
 from dvae.inference.evaluation.metrics import average_pairwise_distance
 from dvae.models.motion.gsps import PRESETS, GSPSModel, part_by_part
 from dvae.models.registry import metric_model
+from dvae.motion.data.protocols import Poses
 from dvae.motion.geometry.parts import body_parts
 from dvae.motion.scoring import energies
 from dvae.networks import GraphConv
@@ -65,6 +67,75 @@ def test_the_model_has_the_published_number_of_parameters(skeleton, observed, le
     layers = into * width + width + nodes**2 + 8 * (width**2 + nodes**2) + width * into + into + nodes**2
     assert generator == 2 * (layers + 9 * 2 * nodes * width)
     assert parameters in (None, generator)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "skeleton", "options", "count"),
+    [
+        ("h36m", motion.HUMAN36M, {}, 10),
+        ("h36m", motion.HUMAN36M, {"coefficients": "code"}, 10),
+        ("h36m", motion.HUMAN36M, {"coefficients": "supplement"}, 20),
+        ("h36m", motion.HUMAN36M, {"bandwidth": 1.8}, 10),
+        ("h36m", motion.HUMAN36M, {"bandwidth": 3.8}, 20),
+        ("humaneva", motion.HUMANEVA, {}, 8),
+        ("humaneva", motion.HUMANEVA, {"coefficients": "supplement"}, 8),
+        ("humaneva", motion.HUMANEVA, {"bandwidth": 2.8}, 8),
+        ("simulated", motion.WALKER, {}, 15),
+        ("simulated", motion.WALKER, {"bandwidth": 1.4}, 8),
+        ("simulated", motion.WALKER, {"bandwidth": 100.0}, 75),
+        ("simulated", motion.WALKER, {"coefficients": 12}, 12),
+    ],
+)
+@pytest.mark.parametrize("name", ["gsps", "bom-parts"])
+def test_the_number_of_coefficients_is_published_or_reaches_a_bandwidth(name, protocol, skeleton, options, count):
+    schema = Poses.from_data(motion.PROTOCOLS[protocol], skeleton)
+    method = dvae.method(name, **options).resolve_defaults(schema)
+    assert (method.coefficients, method.bandwidth) == (count, None)
+    assert method.resolve_defaults(schema) == method
+    if "bandwidth" in options:
+        frequencies = torch.arange(schema.frames + 1) * schema.protocol.fps / (2 * schema.frames)
+        below = frequencies[: schema.frames] <= options["bandwidth"] + 1e-6
+        assert below.sum() == count
+
+
+def test_numbers_of_coefficients_that_do_not_exist_are_errors():
+    walker = Poses.from_data(motion.PROTOCOLS["simulated"], motion.WALKER)
+    with pytest.raises(ValueError, match="numbers for human36m and humaneva, not for the skeleton 'walker'"):
+        dvae.method("gsps", coefficients="supplement").resolve_defaults(walker)
+    with pytest.raises(ValueError, match=r"coefficients is 8 and bandwidth is 2\.8; give only one"):
+        dvae.method("gsps", coefficients=8, bandwidth=2.8)
+
+
+def test_gradients_are_clipped_as_those_of_the_published_loss(windows):
+    """A step with the clip of the presets moves weights as the public code does: norm 100 of weighted means over B."""
+    for name, skeleton in (("h36m", motion.HUMAN36M), ("humaneva", motion.HUMANEVA)):
+        protocol = motion.PROTOCOLS[name]
+        clip = dvae.method("gsps").training(Poses.from_data(protocol, skeleton)).gradient_clip
+        assert clip * protocol.length == pytest.approx(100)
+
+    method = dvae.method("gsps", **SMALL).resolve_defaults(windows)  # windows of 75 frames
+    objective, data, steps = method.objective(), batch(windows), {}
+    for weight in (0.1, 10.0):  # a norm below the clip, and one above it
+        weighted = replace(objective, energy_weights={key: weight * w for key, w in objective.energy_weights.items()})
+        for limit in (None, 100 / 75):
+            torch.manual_seed(0)
+            loop = dvae.SVI(
+                method.build(windows).double(), objective=weighted, optimizer="sgd", learning_rate=1.0,
+                gradient_clip=limit, steps=1, precision="64-true", accelerator="cpu",
+            )  # fmt: skip
+            loop.init()
+            before = [parameter.detach().clone() for parameter in loop.model.parameters()]
+            terms = loop.step(data)
+            published = sum(w * terms.energies[key].mean() for key, w in weighted.energy_weights.items())
+            assert 75 * weighted(terms, 0) == pytest.approx(published.item(), rel=1e-6)  # terms are float32
+            steps[limit] = [old - new.detach() for old, new in zip(before, loop.model.parameters(), strict=True)]
+        weights = [torch.zeros_like(gradient).requires_grad_() for gradient in steps[None]]
+        for parameter, gradient in zip(weights, steps[None], strict=True):
+            parameter.grad = 75 * gradient  # of the published loss
+        norm = torch.nn.utils.clip_grad_norm_(weights, max_norm=100)
+        assert (norm > 100) == (weight > 1)
+        for parameter, step in zip(weights, steps[100 / 75], strict=True):
+            torch.testing.assert_close(75 * step, parameter.grad, rtol=1e-5, atol=1e-9)
 
 
 def test_the_program_runs_in_pyro(windows):
