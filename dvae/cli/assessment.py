@@ -76,6 +76,7 @@ def evaluate(
     log_score_particles: Expert[int] = 0,
     pose_prior: Path | None = None,
     classifier: tuple[Path, ...] = (),
+    several_futures: bool = False,
     seed: int = 0,
     batch_size: Expert[int] = 32,
     out: Path | None = None,
@@ -86,8 +87,8 @@ def evaluate(
     For runs of motion-latent, scores the reconstruction of test segments, next to principal components of equal
     dimension. Options for forecasts do not apply to them.
 
-    Prints the table, and writes it with all settings to evaluation.json in each run, or to --out. With given joints or
-    other data, the file name contains them. Nearest neighbours require the training data of the runs.
+    Prints the table, and writes it with all settings to evaluation.json in each run, or to --out. With given joints,
+    several futures or other data, the file name contains them. Nearest neighbours require the training data of the runs.
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
@@ -98,6 +99,8 @@ def evaluate(
         log_score_particles: number of particles of the log density of the future under the forecasts; 0 omits it.
         pose_prior: run of the method pose-prior, which scores the poses of the forecasts.
         classifier: runs of action-classifiers with different labels, which score the actions in the forecasts.
+        several_futures: score only windows whose last observed pose is shared by another window, as GSPS's tables do.
+            Without it, all windows are scored, as in DLow's.
         seed: seed of the draws.
         batch_size: number of windows forecast at once.
         out: file to write instead of evaluation.json in each run.
@@ -106,13 +109,17 @@ def evaluate(
     at_least(1, samples=samples, batch_size=batch_size)
     at_least(0, bound_particles=bound_particles, log_score_particles=log_score_particles)
     check_files(out, figure, ".json")
-    scoring = ForecastScoring(samples, log_score_particles, pose_prior, classifier, control, missing, failed)
+    if several_futures and control.exchange is not None:
+        raise UsageError("--several-futures needs multimodal futures, which exchanged poses do not have; leave one out")
+    scoring = ForecastScoring(
+        samples, log_score_particles, pose_prior, classifier, control, missing, failed, several_futures
+    )
     score = _segments if loading.kind_of(run, data) == "segments" else _forecasts
     result, record = score(run, data, scoring, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
     save_and_print(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
 
 
-OF_MOTION = ("pose_prior", "classifier", "control", "missing")
+OF_MOTION = ("pose_prior", "classifier", "control", "missing", "several_futures")
 """Options of `evaluate` for motion only."""
 
 
@@ -127,6 +134,7 @@ class ForecastScoring:
     control: Control = Control()
     missing: bool = False
     failed: bool = False
+    several_futures: bool = False
 
 
 def _forecasts(paths: Sequence[Path], data: str | None, scoring: ForecastScoring, **settings: Any) -> tuple[Any, str]:
@@ -141,6 +149,7 @@ def _forecasts(paths: Sequence[Path], data: str | None, scoring: ForecastScoring
         scores = partial(
             motion.scores, pose_prior=_pose_prior(scoring, data, windows.skeleton), classifiers=classifiers
         )
+        windows = motion.several_futures(windows) if scoring.several_futures else windows
         windows = scoring.control.windows(windows, loaded)
     elif inapplicable := [name for name in OF_MOTION if getattr(scoring, name) != getattr(ForecastScoring, name)]:
         raise UsageError(
@@ -157,7 +166,8 @@ def _forecasts(paths: Sequence[Path], data: str | None, scoring: ForecastScoring
         options={} if temperature is None else {"temperature": temperature},
         **settings,
     )
-    return result, f"{loading.record('evaluation', loaded[0], data_set)}{scoring.control}"
+    subset = "-several-futures" * scoring.several_futures
+    return result, f"{loading.record('evaluation', loaded[0], data_set)}{scoring.control}{subset}"
 
 
 def _reference_windows(data_set: Any) -> Any:

@@ -19,6 +19,7 @@ from .geometry.angles import AngleLimits, estimate_angle_limits
 from .geometry.skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skeleton, rotate_about_up
 from .geometry.views import Bones, Heading, Rotations
 from .scoring.criticism import draw_traversal, statistics
+from .scoring.metrics import several_futures
 from .scoring.scores import displacements, scores
 from .scoring.truths import PseudoTruths, WithPseudoTruths
 from .segments.dataset import SegmentData
@@ -72,6 +73,7 @@ __all__ = [
     "rotate_about_up",
     "save",
     "scores",
+    "several_futures",
     "simulate",
     "statistics",
     "transfer",

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -174,6 +175,22 @@ def test_an_evaluation_is_printed_and_stored_with_its_data_and_config(capsys, ru
     assert evaluation.rows["vae"].config["data"]["path"] == str(people)
     assert evaluation.data["fingerprint"] == dvae.load(run).data.windows("test").fingerprint
     assert (run / "scores.png").exists()
+
+
+def test_only_windows_with_several_futures_are_evaluated_on_request(capsys, run, tracker, people, tmp_path):
+    walks = motion.read_motion(people)
+    first = next(clip for clip in walks if clip.split == "test")
+    motion.save(tmp_path / "twins.npz", motion.MotionSet([*walks, replace(first, name="twin")], walks.skeleton))
+    arguments = ["evaluate", str(run), "--data", str(tmp_path / "twins.npz"), "--samples", "2", "--several-futures"]
+    assert main(arguments) == 0
+    (out,) = run.glob("evaluation-*several-futures.json")
+    evaluation = dvae.Evaluation.load(out)
+    assert {*evaluation.clusters} == {f"test/{first.name}", "test/twin"}
+    assert evaluation.data["windows"] == 4
+    assert "4 of 8 windows, those with several" in capsys.readouterr().out.replace("\n", "")
+    assert "none of the 6 windows" in failure(capsys, "evaluate", str(run), "--several-futures")
+    exchange = ["--several-futures", "--joints", "RFoot", "--exchange", "2"]
+    assert "exchanged poses do not have" in failure(capsys, "evaluate", str(tracker), *exchange, code=2)
 
 
 def test_evaluating_runs_on_different_windows_is_an_error(capsys, run, people, tmp_path):

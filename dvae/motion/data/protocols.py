@@ -22,6 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, astuple, dataclass, field, replace
 from math import pi
+from reprlib import repr as brief
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -365,6 +366,8 @@ class Windows:
         self._first = frames.cumsum(0) - frames
         self._classes: dict[str, Tensor] = {}  # variable -> class of every clip
         self._given: Tensor | float | None = None  # set by `given`
+        self._rows: Tensor | None = None  # set by `subset`
+        self._reason = ""
         self._starts = frames - length + 1
         if self.missing:
             is_known = (np.isfinite(block).all(-1) for frames in self._frames for block in blocks(frames))
@@ -436,6 +439,8 @@ class Windows:
         Returns:
             {"x": (B, T, D)}, and "mask" if joints may be missing.
         """
+        if self._rows is not None:
+            raise ValueError(f"a subset of windows ({self._reason}) is for evaluation; draw from all windows")
         clip_draws, start_draws, angle_draws = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
         clips = torch.searchsorted(self._weights, clip_draws * self._weights[-1], right=True)
         starts = (start_draws * self._starts[clips]).long()
@@ -643,7 +648,27 @@ class Windows:
         }
         if (given := self.given_joints) is not None:
             description |= {"given": list(given), "title": [f"given {', '.join(given) or 'no paths'}"]}
+        if self._reason:
+            description["title"] = [*description["title"], self._reason]
         return description
+
+    def subset(self, rows: Sequence[int], reason: str) -> Windows:
+        """Return some of the listed windows, for evaluation: `sample` and lists with another stride are refused.
+
+        Args:
+            rows: indices of the windows in `keys`, ascending.
+            reason: what the windows have in common, for titles.
+
+        Raises:
+            ValueError: there are no rows, or they are not ascending indices of windows.
+        """
+        indices = torch.as_tensor(rows, dtype=torch.long)
+        if not len(indices) or (indices.diff() <= 0).any() or indices[0] < 0 or indices[-1] >= len(self):
+            raise ValueError(f"rows must be ascending indices of the {len(self)} windows, got {brief(list(rows))}")
+        windows = copy(self)
+        windows._rows = indices if self._rows is None else self._rows[indices]
+        windows._reason = f"{len(indices)} of {len(self)} windows, {reason}"
+        return windows
 
     def with_protocol(self, protocol: Protocol) -> Windows:
         """Return these windows, cut by another protocol that splits clips and counts frames in the same way.
@@ -695,6 +720,10 @@ class Windows:
 
     def _keys(self, stride: int) -> Iterator[tuple[str, str, int]]:
         """Yield the keys of the listed windows one at a time, because there may be as many as frames."""
+        if self._rows is not None:
+            clips, starts = (values.tolist() for values in self._list(stride))
+            yield from ((*self.clips[clip].key, start) for clip, start in zip(clips, starts, strict=True))
+            return
         for clip, first, count in zip(self.clips, self._first.tolist(), self._starts.tolist(), strict=True):
             for starts in torch.arange(0, count, _at_least_one(stride)).split(4096):
                 kept_starts = starts[self._has_usable_frames(first + starts)] if self.missing else starts
@@ -703,13 +732,15 @@ class Windows:
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:
         """Return the clip index and first frame of every listed window."""
         stride = _at_least_one(stride)
+        if self._rows is not None and stride != self.stride:
+            raise ValueError(f"a subset of windows ({self._reason}) has the stride {self.stride}, got {stride}")
         counts = (self._starts + stride - 1) // stride
         clips = torch.repeat_interleave(counts)
         starts = stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
-        if not self.missing:
-            return clips, starts
-        is_usable = self._has_usable_frames(self._first[clips] + starts)
-        return clips[is_usable], starts[is_usable]
+        if self.missing:
+            is_usable = self._has_usable_frames(self._first[clips] + starts)
+            clips, starts = clips[is_usable], starts[is_usable]
+        return (clips, starts) if self._rows is None else (clips[self._rows], starts[self._rows])
 
     def _has_usable_frames(self, first: Tensor) -> Tensor:
         """Return whether windows have usable frames in both parts; `first` counts frames over all clips."""

@@ -29,6 +29,7 @@ from ...inference.evaluation.metrics import (
     shape_of,
 )
 from ...inference.evaluation.references import distances, last_places
+from ..data.protocols import Windows
 
 
 def average_displacement_error(samples: Array, truth: Array) -> Tensor:
@@ -64,8 +65,8 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
 
     Two windows belong together if the Euclidean distance of their last observed poses is *below* the threshold, over
     all coordinates; `distances` handles missing values. The default follows the evaluation of DLow (Yuan and Kitani
-    2020): a window belongs to itself. A window without others keeps its single truth and is scored like all windows, as
-    in every evaluation here. (GSPS leaves such windows out of every metric, so its published numbers are on a subset.)
+    2020): a window belongs to itself. A window without others keeps its single truth and is scored like all windows.
+    GSPS leaves such windows out of every metric (`several_futures`), so its published numbers are on a subset.
 
     Args:
         windows: N windows; their protocol defines the observed frames.
@@ -90,6 +91,28 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
         close[torch.arange(len(rows)), rows] = itself
         truths += [row.nonzero()[:, 0] for row in close]
     return truths
+
+
+def several_futures(windows: Windows) -> Windows:
+    """Return the windows whose last observed pose is shared by another window, as in GSPS's evaluation.
+
+    All scores of `dvae.evaluate` are then of these windows only. Their multimodal ground truth does not change, because
+    every window that belongs to one of them is among them. The title of a table gives their number.
+
+    Args:
+        windows: windows of the evaluation; poses closer than their protocol's `multimodal_threshold` count as shared.
+
+    Raises:
+        ValueError: no window has several futures.
+    """
+    threshold = windows.protocol.multimodal_threshold
+    rows = [row for row, truths in enumerate(multimodal_truths(windows, threshold)) if len(truths) > 1]
+    if not rows:
+        raise ValueError(
+            f"none of the {len(windows)} windows has several futures: no two last observed poses are closer than "
+            f"{threshold:g} m; raise the protocol's multimodal_threshold"
+        )
+    return windows.subset(rows, "those with several futures")
 
 
 def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:

@@ -169,3 +169,51 @@ def test_jerk_is_the_third_derivative_including_the_seam(windows):
     assert jerk(leap) == pytest.approx(0.1 * 3**0.5 * fps**3 * 4 / 6)
     real = np.linalg.norm(np.diff(windows.positions(x)[:, 1:, 1:].numpy(), 3, axis=1), axis=-1).mean() * fps**3
     assert measure.note == f"jerk: real motion has {real:.1f} m/s³"
+
+
+def test_only_windows_with_several_futures_are_scored_on_request():
+    """All scores equal a loop that skips windows without another one in the same pose, as GSPS's evaluation does."""
+    standing = motion.simulate(clips=1, frames=10).clips[0]
+    changes = 0.1 * torch.randn(5, 10, 17, 3, generator=torch.Generator().manual_seed(0)).numpy()
+    changes[:, 3] = 0.0  # the last observed pose is A, B, A, neither, B
+    changes[[1, 4], 3, 5], changes[3, 3, 5] = 0.3, 0.6
+    clips = [replace(standing, name=str(n), split="test", positions=standing.positions + changes[n]) for n in range(5)]
+    windows = motion.windows(motion.MotionSet(clips, motion.WALKER), PROTOCOL, "test")
+    kept = motion.several_futures(windows)
+    assert [key[1] for key in kept.keys] == ["0", "1", "2", "4"]
+    assert kept.fingerprint != windows.fingerprint
+    x = windows.all()["x"]
+    assert torch.equal(kept.all()["x"], x[[0, 1, 2, 4]])
+    assert torch.equal(torch.cat([batch["x"] for batch in kept.batches(3)]), kept.all()["x"])
+
+    futures = x[:, None, 4:] + 0.1 * torch.randn(5, 3, 6, 48, generator=torch.Generator().manual_seed(1))
+    errors = (futures[:, :, None] - x[None, None, :, 4:]).norm(dim=-1)  # of a future of one window to another window
+    expected = {name: [] for name in ("APD", "ADE", "FDE", "MMADE", "MMFDE")}
+    for n in range(5):
+        same = [m for m in range(5) if (x[n, 3] - x[m, 3]).norm() < 0.5]
+        if len(same) == 1:
+            continue
+        rows = futures[n].flatten(1)
+        expected["APD"].append(torch.stack([(rows[i] - rows[j]).norm() for i in range(3) for j in range(i)]).mean())
+        expected["ADE"].append(errors[n, :, n].mean(-1).min())
+        expected["FDE"].append(errors[n, :, n, -1].min())
+        expected["MMADE"].append(torch.stack([errors[n, :, m].mean(-1).min() for m in same]).mean())
+        expected["MMFDE"].append(torch.stack([errors[n, :, m, -1].min() for m in same]).mean())
+    model = FixedForecasts(windows, futures)
+    evaluation = dvae.evaluate(model, kept, scores=motion.scores, samples=3, references=False, progress=False)
+    for name, values in expected.items():
+        assert evaluation["model"][name].mean == pytest.approx(torch.stack(values).mean().item(), rel=1e-5), name
+    assert evaluation.data["windows"] == 4
+    assert evaluation.data["title"] == ["4 of 5 windows, those with several futures"]
+    assert evaluation.basis["multimodal"]["alone"] == 0
+    assert scores(windows, futures)["ADE"] != pytest.approx(evaluation["model"]["ADE"].mean, rel=1e-3)
+
+    with pytest.raises(ValueError, match="4 of 5 windows.*is for evaluation"):
+        kept.sample(2, torch.Generator())
+    with pytest.raises(ValueError, match="has the stride 20, got 3"):
+        kept.all(3)
+    with pytest.raises(ValueError, match="ascending indices of the 5 windows"):
+        windows.subset([1, 0], "")
+    apart = motion.windows(motion.MotionSet([clips[n] for n in (0, 1, 3)], motion.WALKER), PROTOCOL, "test")
+    with pytest.raises(ValueError, match="none of the 3 windows has several futures"):
+        motion.several_futures(apart)
