@@ -13,7 +13,7 @@ def differences(first: str, second: str, scores: Path) -> Table:
     """Return a table with a row of the first method's scores minus the second's for each set."""
     columns, lines = [*COLUMNS, *METRIC_MODEL_COLUMNS], []
     for name, selected in SETS.items():
-        if View() in selected.views:
+        if View() in selected.views and {first, second} <= selected.methods.keys():
             rows = entries(scores, name, View(), (first, second))
             lines.append([name, *(cell(rows[first].estimate(column, rows[second])) for column in columns)])
     return Table(["", *columns], lines, f"{first} minus {second}, paired.")

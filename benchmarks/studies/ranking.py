@@ -46,6 +46,7 @@ _SETTINGS = settings(__file__)
 FUTURES: dict[str, dict[str, Any]] = _SETTINGS["futures"]
 PATHS: dict[str, dict[str, Any]] = _SETTINGS["paths"]
 STEPS: dict[str, int] = _SETTINGS["steps"]
+CURVES: dict[str, dict[str, Any]] = _SETTINGS["curves"]
 ALIKE, ALIKE_PATHS = (
     {row: {**options, "steps": STEPS[row]} for row, options in methods.items()} for methods in (FUTURES, PATHS)
 )
@@ -125,6 +126,7 @@ SETS = {
     "bandai2-by-style": Set(BANDAI, FUTURES, metric_models=("prior", "content")),
     "bandai2-by-style-alike": Set(BANDAI, ALIKE, metric_models=("prior", "content"), like="bandai2-by-style"),
     "bandai2-by-take": Set(BANDAI, ALIKE, metric_models=("prior", "content")),
+    "bandai2-by-take-curves": Set(BANDAI, CURVES, metric_models=("prior", "content"), like="bandai2-by-take"),
     "cmu8": Set(CMU, ALIKE, metric_models=("prior", "content")),
     "bandai2-trajectories": Set(BANDAI, PATHS, GIVEN),
     "bandai2-trajectories-alike": Set(BANDAI, ALIKE_PATHS, GIVEN, like="bandai2-trajectories"),
@@ -516,7 +518,7 @@ def main(
         picture: figure of all sets without given paths; drawn only with results.
     """
     refuse_unknown("set", sets, SETS)
-    refuse_unknown("method", methods, {**FUTURES, **PATHS})
+    refuse_unknown("method", methods, {**FUTURES, **PATHS, **CURVES})
     for name in sets:
         selected = SETS[name]
         if data is not None:
@@ -539,7 +541,8 @@ def main(
                 table = ranking(rows, [*COLUMNS, *(METRIC_MODEL_COLUMNS if selected.metric_models else ())])
                 suffix = "" if view.given is None else f"-{view.given}-given"
                 write(results, {f"index/{name}{suffix}": table})
-    sought = {name: rows_of(scores, name, View()) for name, selected in SETS.items() if View() in selected.views}
+    drawn = [name for name, each in SETS.items() if View() in each.views and each.methods is not CURVES]
+    sought = {name: rows_of(scores, name, View()) for name in drawn}
     futures = {name: rows for name, rows in sought.items() if rows}
     if results is not None and futures:
         draw_ranking(futures).savefig(picture, dpi=200)

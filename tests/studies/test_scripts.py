@@ -16,6 +16,7 @@ import torch
 
 from benchmarks import bench, speed
 from benchmarks.studies import (
+    angles,
     audits,
     bones,
     bounds,
@@ -43,6 +44,7 @@ from dvae import Descent, Training, alternatives, method, motion
 from dvae.cli import main as command
 from dvae.inference.training.checkpoints import Run
 from dvae.inference.training.fit import fit
+from dvae.motion.geometry.angles import angle_names, cosines
 from dvae.motion.segments import dataset
 from dvae.runs.directory import load
 from dvae.tables import Column, Columns, Panel, Series
@@ -369,6 +371,32 @@ def test_rotations(folder, out):
     assert (
         float(table[1][2]) == 0 < max(float(row[2]) for row in table[1:]) == float(table[-1][2])
     )  # the root does not move
+
+
+def test_angles(folder, out, monkeypatch):
+    monkeypatch.setattr(angles, "SETS", {"simulated": SimpleNamespace(file="people.npz")})
+    monkeypatch.setattr(angles, "PROTOCOLS", {"by style": "simulated"})
+    angles.main(folder, out)
+    (table,) = tables(out, "gsps/angles")
+    assert {row[0] for row in table[1:]} == {*angle_names(motion.WALKER), angles.ANY}
+    shares = {row[0]: float(row[1].partition("%")[0]) for row in table[1:]}
+    assert max(shares.values()) == shares[angles.ANY] > 0
+
+
+def test_poses_beyond_angle_limits_are_counted():
+    """Half of the poses exceed a limit that is between their angles, by the difference; inactive limits do not count."""
+    poses = motion.windows(motion.simulate(clips=4, frames=90), "simulated", "train").poses()[:101]
+    limits, names = motion.estimate_angle_limits(poses, motion.WALKER), angle_names(motion.WALKER)
+    assert not any(share or excess for share, excess in angles.beyond(poses, limits, motion.WALKER).values())
+    place = names.index("Neck2Spine")
+    cos = cosines(poses, motion.WALKER)[:, place]
+    high = limits.high.clone()
+    high[place] = cos.median()
+    shares = angles.beyond(poses, replace(limits, high=high), motion.WALKER)
+    expected = (cos > cos.median()).double().mean().item()
+    degrees = [torch.rad2deg(value.double().arccos()).item() for value in (cos.median(), cos.max())]
+    assert shares["Neck2Spine"] == shares[angles.ANY] == pytest.approx((expected, degrees[0] - degrees[1]))
+    assert sum(share > 0 for share, _ in shares.values()) == 2
 
 
 def test_trajevae(folder, out):
