@@ -51,7 +51,7 @@ class Section:
         cases: options by name of the case, including those of `Training`.
         options: options of all cases, unless a case overrides them; later changes of a preset do not apply.
         protocol: window protocol.
-        uses_pose_prior: whether the method uses the pose prior of the metric models.
+        uses_pose_prior: whether methods with a pose prior use the one of the metric models.
         seeds: seeds of each case.
     """
 
@@ -72,8 +72,9 @@ class Section:
         """Return the method and the training of a case."""
         options, training_options = split_options({**self.options, **self.cases[case]})
         method = options.pop("method", self.method)
+        applies = self.uses_pose_prior and hasattr(dvae.methods()[method], "pose_prior_run")
         # the pose prior of the metric models reads poses that are rotated to one heading
-        if self.uses_pose_prior and options.get("pose_prior") != 0 and options.get("heading", True):
+        if applies and options.get("pose_prior") != 0 and options.get("heading", True):
             options["pose_prior_run"] = str(prior)
         return dvae.method(method, **options), replace(self.training, **training_options)
 
