@@ -58,7 +58,8 @@ def main(data: Path, results: Path | None = None) -> None:
         train, test = (motion.windows(people, protocol, split).poses() for split in ("train", "test"))
         columns[column] = beyond(test, motion.estimate_angle_limits(train, people.skeleton), people.skeleton)
     rows = sorted(columns["by style"], key=lambda name: [-shares[name][0] for shares in columns.values()])
-    lines = [[name, *(f"{shares[name][0]:.2%}, {shares[name][1]:.1f}°" for shares in columns.values())] for name in rows]
+    cells = {name: [f"{each[name][0]:.2%}, {each[name][1]:.1f}°" for each in columns.values()] for name in rows}
+    lines = [[name, *cells[name]] for name in rows]
     note = "Share of test poses beyond a limit, left or right, and the largest excess."
     write(results, {"gsps/angles": Table(["", *columns], lines, note)})
 

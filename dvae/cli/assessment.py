@@ -88,7 +88,7 @@ def evaluate(
     dimension. Options for forecasts do not apply to them.
 
     Prints the table, and writes it with all settings to evaluation.json in each run, or to --out. With given joints,
-    several futures or other data, the file name contains them. Nearest neighbours require the training data of the runs.
+    several futures or other data, the file name says so. Nearest neighbours require the training data of the runs.
 
     Args:
         run: run directories, fitted on the same data under the same protocol.

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 

@@ -384,7 +384,7 @@ def test_angles(folder, out, monkeypatch):
 
 
 def test_poses_beyond_angle_limits_are_counted():
-    """Half of the poses exceed a limit that is between their angles, by the difference; inactive limits do not count."""
+    """Half of the poses exceed a limit that is their median angle, by the difference to it."""
     poses = motion.windows(motion.simulate(clips=4, frames=90), "simulated", "train").poses()[:101]
     limits, names = motion.estimate_angle_limits(poses, motion.WALKER), angle_names(motion.WALKER)
     assert not any(share or excess for share, excess in angles.beyond(poses, limits, motion.WALKER).values())

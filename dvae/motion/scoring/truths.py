@@ -7,7 +7,8 @@ with the limb lengths of the window x. A candidate is admissible if
     |last observed pose of candidate - last observed pose of x| < threshold          over all coordinates
     mean joint distance of candidate's future from x's          >= minimum           so that near copies drop out
 
-At most `most` admissible candidates, drawn without replacement, follow the observed frames of x.
+At most `most` admissible candidates, drawn without replacement, follow the observed frames of x. The threshold is in
+the paper's supplement; `minimum` and `most` are in its public code.
 
 Candidates are tried in random order until enough of them meet the conditions. Most of the others are excluded in
 advance by matrix products with candidates of average limb lengths. This is valid for two reasons. A mean of distances
@@ -38,7 +39,7 @@ class PseudoTruths:
         threshold: maximum distance of last observed poses, as vectors, in metres.
         minimum: minimum mean joint distance from the window's own future, in metres.
         most: M, maximum number of futures per window.
-        stride: frames between the starts of candidates in a clip; the paper uses 20, and 15 on HumanEva-I.
+        stride: frames between the starts of candidates in a clip; GSPS's public code uses 20, and 15 on HumanEva-I.
         heading: compare poses independently of heading. Candidates are rotated about the up axis so that their last
             observed frame has heading zero; windows must be rotated in the same way by `turn`.
 

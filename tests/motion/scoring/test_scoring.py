@@ -208,7 +208,7 @@ def test_only_windows_with_several_futures_are_scored_on_request():
     assert evaluation.basis["multimodal"]["alone"] == 0
     assert scores(windows, futures)["ADE"] != pytest.approx(evaluation["model"]["ADE"].mean, rel=1e-3)
 
-    with pytest.raises(ValueError, match="4 of 5 windows.*is for evaluation"):
+    with pytest.raises(ValueError, match=r"those with several futures\) is for evaluation"):
         kept.sample(2, torch.Generator())
     with pytest.raises(ValueError, match="has the stride 20, got 3"):
         kept.all(3)
