@@ -653,7 +653,9 @@ class Windows:
         return description
 
     def subset(self, rows: Sequence[int], reason: str) -> Windows:
-        """Return some of the listed windows, for evaluation: `sample` and lists with another stride are refused.
+        """Return some of the listed windows, for evaluation.
+
+        They cannot be drawn by `sample`, or listed with another stride.
 
         Args:
             rows: indices of the windows in `keys`, ascending.
