@@ -93,8 +93,8 @@ class GSPS(EnergyMethod):
             "head=Neck+Head".
         coefficients: number of cosine coefficients of the whole window; or "code" or "supplement" for the number in the
             public code or in the paper's supplement. By default the number in the code, and for skeletons other than
-            Human3.6M's and HumanEva-I's as many as reach `bandwidth`.
-        bandwidth: highest frequency of the coefficients in Hz, in place of their number; 2.8 if neither is given.
+            Human3.6M's and HumanEva-I's as many as reach 2.8 Hz.
+        bandwidth: highest frequency of the coefficients in Hz, in place of their number.
         width: features of a joint in the networks.
         blocks: residual blocks of each network.
         draws: number of draws of each part's latent, in training, for each draw of the earlier parts.
