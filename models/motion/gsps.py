@@ -75,7 +75,7 @@ PRESETS = table(
 )
 """Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
 CLIP = 100.0
-"""Largest norm of the gradient of the published loss, a sum over frames. Ours is that loss over the T frames."""
+"""Largest norm of the gradient of the published loss, which is T times ours, for windows of T frames."""
 
 
 @dataclass(frozen=True)
