@@ -195,8 +195,8 @@ class GSPS(EnergyMethod):
                 )
             return PUBLISHED[count][skeleton]
         if count is None and bandwidth is None:
-            count, bandwidth = self.preset(schema.skeleton)["coefficients"], BANDWIDTH
-        return count or coefficients_up_to(bandwidth, schema.frames, schema.protocol.fps)
+            count = self.preset(schema.skeleton)["coefficients"]
+        return count or coefficients_up_to(bandwidth or BANDWIDTH, schema.frames, schema.protocol.fps)
 
     @override
     def build(self, data: Any) -> GSPSModel:

@@ -384,18 +384,19 @@ def test_angles(folder, out, monkeypatch):
 
 
 def test_poses_beyond_angle_limits_are_counted():
-    """Half of the poses exceed a limit that is their median angle, by the difference to it."""
+    """Half of the poses exceed a limit that is their median; a limit whose cosine is above .98 is inactive."""
     poses = motion.windows(motion.simulate(clips=4, frames=90), "simulated", "train").poses()[:101]
     limits, names = motion.estimate_angle_limits(poses, motion.WALKER), angle_names(motion.WALKER)
     assert not any(share or excess for share, excess in angles.beyond(poses, limits, motion.WALKER).values())
-    place = names.index("Neck2Spine")
-    cos = cosines(poses, motion.WALKER)[:, place]
-    high = limits.high.clone()
-    high[place] = cos.median()
+    cos, high = cosines(poses, motion.WALKER), limits.high.clone()
+    active, inactive = (cos[:, names.index(name)].median() for name in ("Head2HeadTop", "Neck2Spine"))
+    assert active < 0.98 < inactive
+    high[names.index("Head2HeadTop")], high[names.index("Neck2Spine")] = active, inactive
     shares = angles.beyond(poses, replace(limits, high=high), motion.WALKER)
-    expected = (cos > cos.median()).double().mean().item()
-    degrees = [torch.rad2deg(value.double().arccos()).item() for value in (cos.median(), cos.max())]
-    assert shares["Neck2Spine"] == shares[angles.ANY] == pytest.approx((expected, degrees[0] - degrees[1]))
+    cos = cos[:, names.index("Head2HeadTop")]
+    expected = (cos > active).double().mean().item()
+    degrees = [torch.rad2deg(value.double().arccos()).item() for value in (active, cos.max())]
+    assert shares["Head2HeadTop"] == shares[angles.ANY] == pytest.approx((expected, degrees[0] - degrees[1]))
     assert sum(share > 0 for share, _ in shares.values()) == 2
 
 
