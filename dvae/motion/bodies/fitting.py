@@ -34,6 +34,7 @@ from torch.nn.functional import normalize
 
 from ...data.sequences import tensor_of
 from ..data.clips import Clip, MotionSet
+from ..files.smpl import has_smpl_rest
 from ..geometry.kinematics import forward, resting, swing
 from ..geometry.rotations import continuous, from_matrix, to_matrix
 from ..geometry.skeleton import Skeleton
@@ -47,6 +48,9 @@ WITHIN = 0.01
 
 MOST = 3.0
 """Bound on the absolute value of a fitted parameter; one person in four hundred exceeds it."""
+
+ROUNDED = 1e-4
+"""Tolerance in metres within which joint offsets agree with shape parameters up to rounding in single precision."""
 
 SAME = 1e-3
 """Tolerance in metres within which lengths belong to the same body, and joints at rest to the same shape."""
@@ -65,6 +69,9 @@ ALIKE = 0.5
 
 An arm that hangs in one rest pose and points to the side in the other has cosine 0."""
 
+Z_TO_Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+"""Rotation (3, 3) about x of a world with z up to a world with y up."""
+
 _LIMBS = {"hip knee ankle": (1.0, 0.0, 0.0), "shoulder elbow wrist": (0.0, -1.0, 0.0)}
 """Limbs, and the axis about which the left one bends at rest; the axis is mirrored for the right side."""
 
@@ -74,13 +81,15 @@ _NEEDED = ["pelvis", *(f"{side} {part}" for limb in _LIMBS for part in limb.spli
 def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> MotionSet:
     """Fit motion to the joints of a body; the documentation of this module describes how.
 
-    Motion on these joints, with rotations from a similar rest pose (e.g. from AMASS), keeps its rotations.
+    Motion on these joints, with rotations from a similar rest pose (e.g. from AMASS), keeps its rotations. Motion of
+    AMASS on a body from a file of SMPL, SMPL-H or SMPL-X also keeps its `betas`, so nothing is estimated; the root is
+    where SMPL puts it.
 
     Args:
         motion: motion on any skeleton with pelvis, hips, knees, ankles, shoulders, elbows and wrists.
         body: target body, such as `human()`.
-        shapes: shape parameters, (S,) for all clips or (N, S), e.g. from `betas`. Default: fitted to the bone lengths,
-            equal for all clips with the same lengths.
+        shapes: shape parameters, (S,) for all clips or (N, S). Default: `betas` of AMASS on a body from a file; for
+            other motion, fitted to the bone lengths, equal for all clips with the same lengths.
 
     Returns:
         The same clips with y up, with positions of the body's joints in metres, and rotations. `shapes_of` returns
@@ -88,17 +97,20 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
         `Body.forward` is the position of the root minus the root's position at rest.
 
     Raises:
-        ValueError: a required joint is missing in the skeleton or in a frame, or the shapes have a wrong size.
+        ValueError: a required joint is missing in the skeleton or in a frame, the shapes have a wrong size, or a clip of
+            AMASS has too few betas.
     """
     if incomplete := [clip for clip in motion if np.isnan(clip.positions).any()]:
         raise ValueError(
             f"clip {'/'.join(incomplete[0].key)} has missing joints and cannot be fitted to a body; remove it, or "
             "fill its gaps first (`dvae impute RUN --filled FILE`)"
         )
-    motion = _y_up(motion)
     if _has_matching_rotations(motion, body):
+        has_betas = shapes is None and _is_of_smpl(motion, body)
+        shapes = betas(motion, body.parameters_of_shape) if has_betas else shapes
         shapes_of_clips = _known_shapes(motion, body) if shapes is None else _shapes(shapes, motion, body)
-        return _on_bodies(motion, body, shapes_of_clips, (_local_rotations(clip, motion.skeleton) for clip in motion))
+        return _on_bodies(motion, body, shapes_of_clips, _kept_rotations(motion, body, shapes_of_clips))
+    motion = _y_up(motion)
     source = _Source.of(motion, body)
     marks_of_clips = [source.marks(tensor_of(clip.positions).double()) for clip in motion]
     shapes_of_clips = torch.zeros(len(motion), body.parameters_of_shape, dtype=torch.float64)
@@ -127,8 +139,8 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
 def shapes_of(motion: MotionSet, body: Body) -> Tensor:
     """Return shape parameters (N, S) of clips from `fit_to_body`, `retarget` or `TimedFrames.back`.
 
-    The parameters are computed from the offsets of joints by `Body.shape_of`. For other motion, the result is
-    meaningless.
+    On a body from a file, these are the label `betas`, if they agree with the offsets of the joints. Otherwise, the
+    parameters are computed from the offsets by `Body.shape_of`. For other motion, the result is meaningless.
 
     Args:
         motion: N clips with rotations of the body's joints.
@@ -138,7 +150,16 @@ def shapes_of(motion: MotionSet, body: Body) -> Tensor:
         ValueError: the clips have other joints, or no rotations.
     """
     _check(motion, body)
-    return body.shape_of(resting_offsets(motion))
+    offsets, size = resting_offsets(motion), body.parameters_of_shape
+    shapes = body.shape_of(offsets)
+    if is_from_file(body):
+        labels = [clip.labels.get("betas", "").split()[:size] for clip in motion]
+        labelled = torch.tensor([n for n, label in enumerate(labels) if len(label) == size], dtype=torch.long)
+        values = torch.tensor([[float(number) for number in labels[n]] for n in labelled], dtype=torch.float64)
+        if len(labelled):
+            agree = (body.offsets(values) - offsets[labelled]).abs().amax((-2, -1)) < ROUNDED
+            shapes[labelled[agree]] = values[agree]
+    return shapes
 
 
 def retarget(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
@@ -163,6 +184,11 @@ def retarget(motion: MotionSet, body: Body, shapes: Tensor) -> MotionSet:
     return _on_bodies(motion, body, parameters, scaled)
 
 
+def is_from_file(body: Body) -> bool:
+    """Return whether a body was read from a file of SMPL, SMPL-H or SMPL-X."""
+    return body.source is not None and bool(body.source.path)
+
+
 def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
     """Return the shape parameters in AMASS's files, (N, S): the first values of each clip's label `betas`.
 
@@ -180,8 +206,8 @@ def betas(motion: MotionSet, parameters: int = 8) -> Tensor:
         values = clip.labels.get("betas", "").split()
         if len(values) < parameters:
             raise ValueError(
-                f"clip {'/'.join(clip.key)} has {len(values) or 'no'} betas, expected {parameters}; files in AMASS's "
-                "layout contain them, and fit_to_body(motion, body) does not need them"
+                f"clip {'/'.join(clip.key)} has {len(values) or 'no'} betas, expected {parameters}; files of "
+                "AMASS contain 10 or 16. Give shapes= to fit_to_body, or read_body with fewer shapes"
             )
         rows.append([float(number) for number in values[:parameters]])
     return torch.tensor(rows, dtype=torch.float64)
@@ -432,10 +458,28 @@ def _known_shapes(motion: MotionSet, body: Body) -> Tensor:
 
 
 def _local_rotations(clip: Clip, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
-    """Return local rotations (F, J, 3, 3) of a clip, and positions of its root (F, 3)."""
+    """Return local rotations (F, J, 3, 3) of a clip, and positions of its root (F, 3), both with y up."""
     assert clip.rotations is not None
     local = to_matrix(tensor_of(clip.rotations).double(), "quaternion")
-    return local, tensor_of(clip.positions[:, skeleton.root]).double()
+    root = tensor_of(clip.positions[:, skeleton.root]).double()
+    if skeleton.up == "z":
+        local[:, skeleton.root] = Z_TO_Y @ local[:, skeleton.root]
+        root = root @ Z_TO_Y.T
+    return local, root
+
+
+def _kept_rotations(motion: MotionSet, body: Body, shapes: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield local rotations and root positions of each clip, both with y up, of motion with matching rotations.
+
+    SMPL adds `trans` to the root at rest, in the axes of the file.
+    """
+    pelvis = torch.zeros(len(motion), 3, dtype=torch.float64)
+    if _is_of_smpl(motion, body):
+        pelvis = body.joints_at_rest(shapes.to(body.template))[:, body.parents.index(-1)].double()
+        pelvis = pelvis @ Z_TO_Y.T if motion.skeleton.up == "z" else pelvis
+    for clip, place in zip(motion, pelvis, strict=True):
+        local, root = _local_rotations(clip, motion.skeleton)
+        yield local, root + place
 
 
 def _has_matching_rotations(motion: MotionSet, body: Body) -> bool:
@@ -445,9 +489,16 @@ def _has_matching_rotations(motion: MotionSet, body: Body) -> bool:
         return False
     if (skeleton.names, skeleton.parents) != (body.names, body.parents):
         return False
+    if _is_of_smpl(motion, body):
+        return True
     bones = body.offsets(torch.zeros(body.parameters_of_shape, dtype=torch.float64))
     cosines = torch.cosine_similarity(bones, skeleton.offsets, dim=-1)
     return bool((cosines > ALIKE)[[joint for _, joint in skeleton.edges]].all())
+
+
+def _is_of_smpl(motion: MotionSet, body: Body) -> bool:
+    """Return whether rotations refer to the rest pose of SMPL's own files, and the body is in such a file."""
+    return is_from_file(body) and has_smpl_rest(motion.skeleton)
 
 
 def _check(motion: MotionSet, body: Body) -> None:
@@ -459,28 +510,25 @@ def _check(motion: MotionSet, body: Body) -> None:
 
 
 def _y_up(motion: MotionSet) -> MotionSet:
-    """Return motion with y up, rotated about x; the rest pose does not depend on the world and is not changed."""
+    """Return motion with y up, rotated about x, without rotations of joints."""
     if motion.skeleton.up == "y":
         return motion
-    turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
-    clips = []
-    for clip in motion:
-        rotations = clip.rotations
-        if rotations is not None:
-            local, _ = _local_rotations(clip, motion.skeleton)
-            local[:, motion.skeleton.root] = turn @ local[:, motion.skeleton.root]
-            rotations = continuous(from_matrix(local, "quaternion")).numpy()
-        clips.append(replace(clip, positions=clip.positions @ turn.numpy().T, rotations=rotations))
+    turn = Z_TO_Y.float().numpy().T
+    clips = [replace(clip, positions=clip.positions @ turn, rotations=None) for clip in motion]
     return replace(motion, clips=clips, skeleton=replace(motion.skeleton, up="y"))
 
 
 def _on_bodies(motion: MotionSet, body: Body, shapes: Tensor, rotations: Iterable[tuple[Tensor, Tensor]]) -> MotionSet:
     """Return clips on bodies (N, S) with local rotations (F, J, 3, 3) and root positions (F, 3)."""
     offsets, clips = body.offsets(shapes), []
-    for clip, bones, (local, root) in zip(motion, offsets, rotations, strict=True):
-        quaternions = continuous(from_matrix(local, "quaternion")).numpy()
+    for clip, shape, bones, (local, root) in zip(motion, shapes, offsets, rotations, strict=True):
+        quaternions = continuous(from_matrix(local, "quaternion"))
         positions, _ = forward(body.parents, local, bones, root)
-        clips.append(replace(clip, positions=positions.numpy(), rotations=quaternions))
+        # the precision of `MotionSet`; all clips in double precision would need twice the memory
+        labels = {**clip.labels, "betas": " ".join(map(str, shape.tolist()))} if is_from_file(body) else clip.labels
+        clips.append(
+            replace(clip, positions=positions.float().numpy(), rotations=quaternions.float().numpy(), labels=labels)
+        )
     source = motion.skeleton
     rest = tuple(offsets.mean(0).flatten().tolist())
     skeleton = Skeleton(body.names, body.parents, *sides(body.names), "y", source.fps, source.name, rest=rest)

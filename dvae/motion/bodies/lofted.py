@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ..files.smpl import JOINTS, PARENTS
 from .measures import enclosed_volume
-from .skinning import Body
+from .skinning import Body, BodySource
 
 SHAPE = ("size", "girth", "legs", "arms", "torso", "shoulders", "hips", "head")
 """The shape parameters, in order.
@@ -227,7 +227,7 @@ def human() -> Body:
         >>> float(tall[:, 1].max() - tall[:, 1].min()) > 1.8
         True
     """
-    return Body(JOINTS, PARENTS, *(tensor.clone() for tensor in _arrays()))
+    return Body(JOINTS, PARENTS, *(tensor.clone() for tensor in _arrays()), BodySource(shapes=len(SHAPE)))
 
 
 @cache

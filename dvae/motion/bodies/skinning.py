@@ -11,6 +11,7 @@ vertices of all T frames are a single matrix product of the joint transforms, (3
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,21 @@ from ..geometry.kinematics import forward
 
 RANK_TOLERANCE = 1e-5
 """Relative singular value below which joint offsets do not determine a shape parameter."""
+
+
+@dataclass(frozen=True)
+class BodySource:
+    """Record of a body, for runs: they store which file a body is in, but never the body.
+
+    Args:
+        path: path of the model file as the user gave it; empty for the bundled person.
+        fingerprint: SHA-256 of the arrays that `read_body` returned; empty for the bundled person.
+        shapes: number of shape parameters S.
+    """
+
+    path: str = ""
+    fingerprint: str = ""
+    shapes: int = 8
 
 
 class Body(nn.Module):
@@ -36,6 +52,7 @@ class Body(nn.Module):
         regressor: (J, V), joints as weighted means of vertices; each row sums to 1.
         weights: (V, J), skinning weights; each row sums to 1.
         faces: (F, 3), triangles of vertex indices, counterclockwise from outside.
+        source: record of the body, by which runs reopen it; None for a body that was made in Python.
 
     Raises:
         ValueError: the shapes of the arrays do not match.
@@ -56,6 +73,7 @@ class Body(nn.Module):
         regressor: Tensor,
         weights: Tensor,
         faces: Tensor,
+        source: BodySource | None = None,
     ):
         super().__init__()
         vertices, joints = len(template), len(names)
@@ -71,7 +89,7 @@ class Body(nn.Module):
                 sizes_of_body = f"{vertices} vertices and {joints} joints"
                 raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {sizes} for {sizes_of_body}")
             self.register_buffer(name, tensor, persistent=False)
-        self.names, self.parents = tuple(names), tuple(parents)
+        self.names, self.parents, self.source = tuple(names), tuple(parents), source
 
     @property
     def parameters_of_shape(self) -> int:
@@ -89,7 +107,7 @@ class Body(nn.Module):
         Args:
             shape: shape parameters (..., S).
         """
-        return _changed(self.template, self.shapes, shape), self._pivots(shape)
+        return _changed(self.template, self.shapes, shape), self.joints_at_rest(shape)
 
     def offsets(self, shape: Tensor) -> Tensor:
         """Return rest offsets (..., J, 3) of joints from their parents in metres, from shape parameters (..., S).
@@ -202,7 +220,7 @@ class Body(nn.Module):
             self._check(shape, *motion)
         surface = self._weighted(shape)
         form = surface.mT @ surface / surface.shape[-2]
-        pivots = self._pivots(shape)
+        pivots = self.joints_at_rest(shape)
         first_transforms, second_transforms = (
             _flat(_posed(pivots, rotations, self.parents)[0]) for rotations, _ in (first, second)
         )
@@ -218,15 +236,19 @@ class Body(nn.Module):
         surface = torch.cat([resting, torch.ones_like(resting[..., :1])], -1)
         return (self.weights[..., None] * surface[..., None, :]).flatten(-2)
 
-    def _pivots(self, shape: Tensor) -> Tensor:
-        """Return joints at rest (..., J, 3) without computing vertices, since joints are linear in the shape too."""
+    def joints_at_rest(self, shape: Tensor) -> Tensor:
+        """Return joints (..., J, 3) in metres at rest, from shape parameters (..., S), without computing vertices.
+
+        Args:
+            shape: shape parameters (..., S).
+        """
         changes = (self.regressor @ self.shapes.flatten(1)).unflatten(-1, (3, -1))
         return _changed(self.regressor @ self.template, changes, shape)
 
     def _posed(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
         """Return joint transforms (..., T, J, 3, 4), and joints (..., T, J, 3), without translation."""
         self._check(shape, rotations, translation)
-        return _posed(self._pivots(shape), rotations, self.parents)
+        return _posed(self.joints_at_rest(shape), rotations, self.parents)
 
     def _check(self, shape: Tensor, rotations: Tensor, translation: Tensor) -> None:
         frames = translation.shape[:-1]

@@ -7,6 +7,8 @@ tissue are ignored.
 
 from __future__ import annotations
 
+import hashlib
+import os
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,8 @@ import torch
 
 from ..files.archive import archive
 from ..files.smpl import JOINTS, PARENTS
-from .skinning import Body
+from .lofted import human
+from .skinning import Body, BodySource
 
 LARGEST = 2**27
 """Maximum size of an array in bytes; the largest array of SMPL-X has three quarters of this size."""
@@ -35,7 +38,7 @@ _MEMBERS: dict[str, tuple[str | int, ...]] = {  # member -> its axes: vertices, 
 }
 
 
-def read_body(path: str | Path, shapes: int = 8) -> Body:
+def read_body(path: str | os.PathLike[str], shapes: int = 8) -> Body:
     """Read a model file, npz, of SMPL, SMPL-H or SMPL-X.
 
     The body has the 22 joints of trunk and limbs that these models share. Fingers, jaw and eyes are not rotated: their
@@ -52,7 +55,7 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
         FileNotFoundError: the file does not exist.
         ValueError: the file is damaged, too large, or not a body; or `shapes` is not between 1 and the file's number.
     """
-    path = Path(path)
+    source, path = os.fspath(path), Path(path)
     with archive(path) as members:
         if missing := [name for name in _MEMBERS if name not in members]:
             raise ValueError(
@@ -72,7 +75,40 @@ def read_body(path: str | Path, shapes: int = 8) -> Body:
     for parent in arrays["kintree_table"][0, len(JOINTS) :]:
         goes_with.append(goes_with[int(parent)])
     weights_of_joints = torch.zeros(len(template), len(JOINTS)).index_add(1, torch.tensor(goes_with), weights)
-    return Body(JOINTS, PARENTS, template, changes, regressor[: len(JOINTS)], weights_of_joints, faces)
+    tensors = [template, changes.contiguous(), regressor[: len(JOINTS)], weights_of_joints, faces]
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(repr(tuple(tensor.shape)).encode())
+        digest.update(tensor.numpy().tobytes())
+    return Body(JOINTS, PARENTS, *tensors, BodySource(source, digest.hexdigest(), shapes))
+
+
+def reopen_body(source: BodySource) -> Body:
+    """Return the body of a run, from its file or the bundled person.
+
+    Args:
+        source: record of the body.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not a body, or another one.
+    """
+    if not source.path:
+        return human()
+    advice = (
+        "runs do not contain body files, because their licences forbid to distribute them; restore the file "
+        f"(fingerprint {source.fingerprint[:12]}…), or correct `schema.body.path` in config.json of the run"
+    )
+    if not Path(source.path).is_file():
+        raise FileNotFoundError(f"the run uses the body in {source.path}, which does not exist here; {advice}")
+    body = read_body(source.path, source.shapes)
+    assert body.source is not None
+    if body.source.fingerprint != source.fingerprint:
+        raise ValueError(
+            f"the run uses another body than {source.path} contains (fingerprint {body.source.fingerprint[:12]}…); "
+            f"{advice}"
+        )
+    return body
 
 
 def _defect(arrays: dict[str, np.ndarray], shapes: int) -> str:

@@ -235,6 +235,12 @@ class Member:
         """Unpacked size in bytes."""
         return self._info.file_size
 
+    @property
+    def kind(self) -> str:
+        """NumPy's kind of the elements, such as "f" for floats, "U" for text and "O" for pickled objects."""
+        with self._open() as stream:
+            return header(stream.read_up_to)[0].kind
+
     def array(self) -> np.ndarray:
         """Return the array of numbers or text.
 

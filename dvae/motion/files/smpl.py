@@ -4,7 +4,8 @@ The files contain no bone lengths. These depend on the SMPL body, which has its 
 `betas`, which each clip stores as a label (`bodies.betas` reads it). Without the SMPL body, all people have one average
 body with a height of 1.7 m. Its segment lengths are from Drillis and Contini (1966), in figure 4.1 of Winter,
 Biomechanics and Motor Control of Human Movement. The pelvis position is correct up to a constant, because SMPL adds the
-position of its template to `trans`. Files written here also contain `offsets`, which are used when they are read.
+position of its template to `trans`. `bodies.fit_to_body` puts such motion on an SMPL body exactly. Files written here
+also contain `offsets`, which are used when they are read.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ...data.npy import NpyError
 from ..data.clips import Clip, MotionSet
 from ..geometry.kinematics import inverse
 from ..geometry.rotations import from_matrix, to_matrix
-from ..geometry.skeleton import Skeleton
+from ..geometry.skeleton import Skeleton, brief, is_name
 from ..naming import sides
 from ..scoring.matching import JointSubset, against_world, parts
 from .archive import archive, write_arrays
@@ -64,7 +65,9 @@ _FPS = ("mocap_framerate", "mocap_frame_rate")
 
 
 def read_amass(path: str | Path) -> Recording:
-    """Read an npz of AMASS: the 22 joints of the body, z up; `betas` becomes a label of space-separated numbers.
+    """Read an npz of AMASS: the 22 joints of the body, z up.
+
+    `betas` becomes a label of space-separated numbers, and `gender` a label. Hands and soft tissue are left out.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -80,6 +83,8 @@ def read_amass(path: str | Path) -> Recording:
             )
         names = ("poses", "trans", "offsets", "betas", *_FPS)
         arrays = {name: members[name].array() for name in names if name in members}
+        has_gender = "gender" in members and members["gender"].kind in "US"  # pickled in some files
+        gender = members["gender"].array() if has_gender else np.zeros(0)
     poses, places = arrays["poses"], arrays["trans"]
     frames, numbers = len(places) if places.ndim else 0, 3 * len(JOINTS)
     if not (poses.ndim == 2 and len(poses) == frames > 0 and poses.shape[1] >= numbers and places.shape == (frames, 3)):
@@ -109,11 +114,26 @@ def read_amass(path: str | Path) -> Recording:
     rest[:, 0] = torch.from_numpy(places.astype(np.float64))
     recording = Recording.turned(JOINTS, PARENTS, rest, to_matrix(vectors, "vector"), fps, metres=1.0, up="z")
     betas = arrays.get("betas", np.zeros(0)).reshape(-1)[:MOST_BETAS]
-    return replace(recording, labels={"betas": " ".join(map(str, betas.tolist()))} if betas.size else {})
+    labels = {"betas": " ".join(map(str, betas.tolist()))} if betas.size else {}
+    if gender.size == 1:
+        name = gender.item() if gender.dtype.kind == "U" else gender.item().decode("ascii", "replace")
+        if not is_name(name):
+            raise ValueError(f"{path}: gender is {brief(name)}, expected a word")
+        labels["gender"] = name
+    return replace(recording, labels=labels)
+
+
+def has_smpl_rest(skeleton: Skeleton) -> bool:
+    """Return whether rotations of a skeleton refer to SMPL's own rest pose, as in a file of AMASS without `offsets`."""
+    if (skeleton.names, skeleton.parents) != (JOINTS, PARENTS) or not skeleton.rest:
+        return False
+    return bool(np.abs(np.array(skeleton.rest).reshape(OFFSETS.shape) - OFFSETS).max() < 1e-5)
 
 
 def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
-    """Write a clip in AMASS's layout: poses (F, 156), trans, mocap_framerate, betas (its label, or zeros) and offsets.
+    """Write a clip in AMASS's layout: poses (F, 156), trans, mocap_framerate, offsets, betas and gender.
+
+    Betas and gender are labels of the clip, by default zeros and neutral.
 
     Joints are matched by name; SMPL joints that the skeleton does not have keep the identity rotation. If a bone
     between two matched joints is not rigid, all rotations are estimated from positions, as in
@@ -163,7 +183,7 @@ def write_amass(path: str | Path, clip: Clip, skeleton: Skeleton) -> None:
     poses[:, : 3 * len(JOINTS)] = from_matrix(smpl_rotations, "vector").flatten(1).numpy()
     betas = np.array([float(value) for value in clip.labels.get("betas", "").split()] or [0.0] * 16)
     arrays = {"poses": poses, "trans": places.numpy(), "betas": betas, "offsets": all_offsets}
-    arrays |= {"mocap_framerate": np.array(skeleton.fps), "gender": np.array("neutral")}
+    arrays |= {"mocap_framerate": np.array(skeleton.fps), "gender": np.array(clip.labels.get("gender", "neutral"))}
     with files.atomic_write(path) as file:
         write_arrays(file, arrays.items())
 

@@ -4,8 +4,9 @@ Marsot, Wuhrer, Franco and Durocher (2021), arXiv 2106.04387, section 3:
 
     chi = [Theta, Gamma, Phi]     N frames of joint rotations, root position, and time
 
-* Theta: the rotation of every joint with children as six numbers, minus the identity, 1 0 0 0 1 0. Joints without
-  children are left out, because their rotations move nothing; they return as the identity.
+* Theta: rotations of joints as six numbers each, minus the identity, 1 0 0 0 1 0. A joint without children is left out
+  if its rotation is constant in the training segments. Positions do not determine it, and the feet of AMASS do not
+  rotate. It returns as the identity. SMPL's 22 joints without the feet have 120 numbers, as in the paper.
 * Gamma: the position of the root relative to the first frame, scaled to lie between -1 and 1.
 * Phi: the time since the previous frame; 0 in the first frame. The sum of Phi is the duration of a segment from its
   first to its last frame: (F - 1) / fps for F frames.
@@ -16,6 +17,7 @@ vertical direction is preserved.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
@@ -32,7 +34,7 @@ from ...options import Positive, Size, check
 from ..data.clips import Clip, MotionSet
 from ..geometry import kinematics
 from ..geometry.rotations import continuous, from_matrix, normalised, to_matrix
-from ..geometry.skeleton import Skeleton, rotate_about_up
+from ..geometry.skeleton import Skeleton, brief, rotate_about_up
 from ..geometry.views import HEADING
 from .gait import Reference, stamps
 
@@ -54,6 +56,9 @@ STEADY = 1e-3
 BRIEFEST = 0.01
 """Minimum time increment of a decoded frame, relative to the even increment of the longest segment."""
 
+CONSTANT = 1e-2
+"""Largest angle in radians between rotations of a joint that counts as constant."""
+
 AT_ONCE = 4096
 """Number of frames of equally long clips that are processed at once, so that they fit into a processor's cache."""
 
@@ -69,12 +74,15 @@ class TimedFrames:
         seconds: unit of durations in seconds: if N frames are spaced evenly over this duration, their time increments
             are 1.
         mean, deviation: means and standard deviations (6 K,) that standardise the six numbers of each of the K joints
-            with children; default: the identity rotation, and 1.
+            in `joints`; default: the identity rotation, and 1.
         references: reference cycles for time warping. Frame n of chi is the point in the segment that is aligned with
             frame n of the nearest reference, resampled to N frames (`gait.stamps`). Default: N frames evenly in time.
+        joints: names of the K joints whose rotations a frame contains; the others have the identity rotation. Default:
+            the joints with children.
 
     Raises:
-        ValueError: the skeleton has no rest pose or sides, or `mean` or `deviation` have a wrong number of values.
+        ValueError: the skeleton has no rest pose or sides, `mean` or `deviation` have a wrong number of values, or
+            `joints` are not joints of the skeleton with all its joints with children.
 
     Example:
         >>> people = dvae.motion.simulate(clips=2, frames=60).with_rotations()
@@ -90,6 +98,7 @@ class TimedFrames:
     mean: Sequence[float] = ()
     deviation: Sequence[float] = ()
     references: Sequence[Reference] = ()
+    joints: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         check(self)
@@ -97,11 +106,15 @@ class TimedFrames:
             getattr(self.skeleton, attribute)  # these properties raise errors that explain what to do
         if self.frames < 2:
             raise ValueError(f"frames must be at least 2, got {self.frames}")
+        parents = {self.skeleton.names[parent] for parent, _ in self.skeleton.edges}
+        if self.joints and not parents <= {*self.joints} <= {*self.skeleton.names}:
+            raise ValueError(
+                f"`joints` are {brief(self.joints)}; expected names of joints of the skeleton {self.skeleton.name!r}, "
+                f"among them all with children: {', '.join(parents)}"
+            )
         for name in ("mean", "deviation"):
             if (numbers := len(getattr(self, name))) not in (0, 6 * len(self.turning)):
-                raise ValueError(
-                    f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints with children"
-                )
+                raise ValueError(f"{name} has {numbers} numbers, expected 6 for each of {len(self.turning)} joints")
         if not np.isfinite([*self.mean, *self.deviation]).all():
             raise ValueError("`mean` and `deviation` must be finite, got NaN or infinite numbers")
         if any(value <= 0 for value in self.deviation):
@@ -116,6 +129,9 @@ class TimedFrames:
         references: Sequence[Reference] = (),
     ) -> Self:
         """Return the conversion with units estimated from training segments.
+
+        Frames contain the rotations of joints with children, and of joints without children that rotate in the
+        segments.
 
         Args:
             motion: segments with rotations.
@@ -152,7 +168,7 @@ class TimedFrames:
         """
         if scaling not in ("identity", "deviation"):
             raise ValueError(f"scaling is {scaling!r}; expected 'identity' or 'deviation'")
-        view = cls(motion.skeleton, frames, references=references)
+        view = cls(motion.skeleton, frames, references=references, joints=_rotating(motion))
         unscaled = view._unscaled(motion)
         # in single precision, so that units do not depend on the last digits of a double
         x = view._scaled(unscaled)[WHOLE]
@@ -166,8 +182,15 @@ class TimedFrames:
 
     @property
     def turning(self) -> list[int]:
-        """Indices of the K joints with children, whose rotations a frame contains."""
+        """Indices of the K joints whose rotations a frame contains."""
+        if self.joints:
+            return sorted(self.skeleton.names.index(name) for name in {*self.joints})
         return sorted({parent for parent, _ in self.skeleton.edges})
+
+    @property
+    def still(self) -> list[str]:
+        """Names of the other joints, which have the identity rotation."""
+        return [name for n, name in enumerate(self.skeleton.names) if n not in self.turning]
 
     @property
     def size(self) -> int:
@@ -192,6 +215,9 @@ class TimedFrames:
 
         Raises:
             ValueError: a clip has no rotations, only one frame, or another skeleton.
+
+        Warns:
+            UserWarning: a joint rotates that frames do not contain.
         """
         return self._scaled(self._unscaled(motion))
 
@@ -241,7 +267,7 @@ class TimedFrames:
             x: frames (..., N, D).
 
         Returns:
-            local rotations of all joints (..., N, J, 3, 3), which are the identity for joints without children; root
+            local rotations of all joints (..., N, J, 3, 3), which are the identity for the joints in `still`; root
             positions relative to the first frame (..., N, 3) in metres; and times since the first frame (..., N) in
             seconds.
 
@@ -315,13 +341,25 @@ class TimedFrames:
         first = torch.from_numpy(np.stack([clip.positions[0] for clip in motion])).double()
         heading = skeleton.heading(first)
         x = first.new_empty(len(motion), self.frames, self.size)
+        still = [skeleton.names.index(name) for name in self.still]
+        left_out = first.new_zeros(len(still))
         for rows, quaternions, positions in _of_one_length(motion):
+            angles = 2 * quaternions[:, :, still, 0].abs().clamp(max=1).acos()
+            left_out = torch.maximum(left_out, angles.flatten(0, 1).amax(0))
             frames = np.linspace(0, quaternions.shape[1] - 1, self.frames)[None]
             if self.references:
                 clips = (motion.clips[n] for n in rows)
                 frames = np.stack([stamps(clip, self.skeleton, self.references, self.frames) for clip in clips])
             x[rows] = self._resampled(
                 quaternions, positions[:, :, skeleton.root], frames, skeleton.fps, -heading[rows, None]
+            )
+        if rotated := [
+            f"{name} ({float(a.rad2deg()):.0f}°)" for name, a in zip(self.still, left_out, strict=True) if a > CONSTANT
+        ]:
+            warnings.warn(
+                f"frames do not contain the rotations of {', '.join(rotated)}; the angles are the largest ones. These "
+                "joints return with the identity rotation",
+                stacklevel=3,
             )
         origin, offsets = first[:, skeleton.root], resting_offsets(motion)
         return {WHOLE: x, HEADING: heading, ORIGIN: origin, OFFSETS: offsets}
@@ -362,7 +400,7 @@ class TimedFrames:
         return rotate_about_up(turn.mT, angle[..., None], up).mT, rotate_about_up(positions, angle, up)
 
     def _six_numbers(self, x: Tensor) -> Tensor:
-        """Return the six numbers (..., K, 6) of each joint with children from frames (..., D), without scaling."""
+        """Return the six numbers (..., K, 6) of each joint in a frame from frames (..., D), without scaling."""
         mean, deviation = self._scaling(x)
         numbers: Tensor = (x[..., :-4] * deviation + mean).unflatten(-1, (-1, 6))
         return numbers
@@ -370,6 +408,22 @@ class TimedFrames:
     def _scaling(self, like: Tensor) -> tuple[Tensor, Tensor]:
         unturned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(self.turning)
         return constant(self.mean or unturned, like), constant(self.deviation or (1.0,) * len(unturned), like)
+
+
+def _rotating(motion: MotionSet) -> tuple[str, ...]:
+    """Return the names of joints whose rotations frames need; empty for the joints with children."""
+    skeleton = motion.skeleton
+    parents = {parent for parent, _ in skeleton.edges}
+    leaves = [joint for joint in range(skeleton.joints) if joint not in parents]
+    first = next((clip.rotations[0, leaves] for clip in motion if clip.rotations is not None), None)
+    if first is None:
+        return ()
+    cosines = np.ones(len(leaves))
+    for clip in motion:
+        if clip.rotations is not None:
+            cosines = np.minimum(cosines, np.abs((clip.rotations[:, leaves] * first).sum(-1)).min(0))
+    rotating = {leaf for leaf, cosine in zip(leaves, cosines, strict=True) if cosine < np.cos(CONSTANT / 2)}
+    return tuple(skeleton.names[joint] for joint in sorted(parents | rotating)) if rotating else ()
 
 
 def resting_offsets(motion: MotionSet) -> Tensor:

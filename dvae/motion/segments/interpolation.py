@@ -70,7 +70,7 @@ class Interpolation:
     def local_pose(self) -> Tensor:
         """Mean angle (B, M) in degrees of joint rotations relative to the first step.
 
-        The mean is over frames and over all joints with children except the root. Rotations are relative to the parent.
+        The mean is over frames and over all joints in them except the root. Rotations are relative to the parent.
         """
         others = [joint for joint in self.timed.turning if joint != self.timed.skeleton.root]
         return self._mean_angle(self._unpacked[0][..., others, :, :])
