@@ -107,6 +107,10 @@ class DataOptions(ColumnOptions):
         warped: for motion-latent: align segments in time with the most typical gait cycles.
         bodies: for motion-latent: standard deviation of the body shapes drawn for training segments; 0 keeps the
             recorded bodies.
+        body: for motion-latent: model file of SMPL, SMPL-H or SMPL-X, npz; by default the bundled person. Files of
+            AMASS keep their rotations and betas on it.
+        betas: for motion-latent: number of shape parameters of the body in a file.
+        hold_out: for motion-latent: folders of the data that are the test data, such as SFU TotalCapture.
         observed: for a table: number of observed steps before a forecast.
         horizon: for a table: number of steps to forecast.
         stride: for a table: steps from one test window to the next.
@@ -125,6 +129,9 @@ class DataOptions(ColumnOptions):
     scaling: Expert[Literal["identity", "deviation"]] = "identity"
     warped: Expert[bool] = False
     bodies: Expert[Amount] = 1.0
+    body: Path | None = None
+    betas: Expert[int] = 8
+    hold_out: tuple[str, ...] = ()
     observed: int | None = None
     horizon: int | None = None
     stride: Expert[int | None] = None
@@ -162,7 +169,7 @@ class DataOptions(ColumnOptions):
         given = {name: value for name, value in given.items() if name not in columns} | self.given()
         with arguments() if kind == "panel" else nullcontext():  # the columns of a table are arguments
             data_set = DATA[kind].open(given.pop("data", SIMULATED), **given)
-        if isinstance(data_set, PanelData | motion.MotionData):
+        if isinstance(data_set, PanelData | motion.MotionData | motion.SegmentData):
             for description in data_set.parts().values():
                 ERROR.print(description, markup=False)
         if isinstance(data_set, PanelData):
@@ -172,7 +179,7 @@ class DataOptions(ColumnOptions):
 
 OF_KINDS = {
     "motion": ("protocol", "representation", "missing", "skip_bad"),
-    "segments": ("cut", "scaling", "warped", "bodies", "skip_bad"),
+    "segments": ("cut", "scaling", "warped", "bodies", "body", "betas", "hold_out", "skip_bad"),
     "panel": (
         *(field.name for field in fields(ColumnOptions)),
         *("observed", "horizon", "stride", "split", "validation", "test", "season"),

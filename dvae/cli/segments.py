@@ -180,7 +180,7 @@ def _other_segments(data_set: Any, takes: Collection[str]) -> Mapping[str, Any] 
     """Return training segments from takes other than `takes`; None without such segments."""
     others = [clip for clip in data_set.segments if clip.split == "train" and clip.labels["source"] not in takes]
     clips = subsample_clips(others, MOST_KNOWN)
-    return motion.Segments(replace(data_set.segments, clips=clips), data_set.timed).all() if clips else None
+    return data_set.of_clips(clips).all() if clips else None
 
 
 def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:

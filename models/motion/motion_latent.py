@@ -44,7 +44,7 @@ from ...inference.training.gradnorm import GradNorm
 from ...inference.training.objectives import Evidence
 from ...inference.training.options import Stage
 from ...inference.training.recipe import Recipe
-from ...motion.bodies import Body, human
+from ...motion.bodies import Body, reopen_body
 from ...motion.segments.embodied import SHAPE, SegmentSchema, surfaces_of
 from ...networks import NetworkSpec, WholeDecoder, WholeEncoder
 from ...networks.base import share_modules
@@ -119,7 +119,7 @@ class MotionLatent(Method):
         }
         model_arguments |= {"network": networks, "distributions": self.distributions()}
         model = (
-            MotionLatentModel(self, schema, human(), **model_arguments)
+            MotionLatentModel(self, schema, reopen_body(schema.body), **model_arguments)
             if isinstance(schema, SegmentSchema)
             else DynamicalVAE(**model_arguments, observed=PARTS)
         )

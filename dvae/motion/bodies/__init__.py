@@ -11,18 +11,20 @@ torch.Size([2, 8])
 from .fitting import betas, fit_to_body, retarget, shapes_of
 from .lofted import MARKERS, SHAPE, human
 from .measures import enclosed_volume, vertex_error
-from .skinning import Body
-from .smplx import read_body
+from .skinning import Body, BodySource
+from .smplx import read_body, reopen_body
 
 __all__ = [
     "MARKERS",
     "SHAPE",
     "Body",
+    "BodySource",
     "betas",
     "enclosed_volume",
     "fit_to_body",
     "human",
     "read_body",
+    "reopen_body",
     "retarget",
     "shapes_of",
     "vertex_error",

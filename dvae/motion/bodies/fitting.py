@@ -97,8 +97,8 @@ def fit_to_body(motion: MotionSet, body: Body, shapes: Tensor | None = None) -> 
         `Body.forward` is the position of the root minus the root's position at rest.
 
     Raises:
-        ValueError: a required joint is missing in the skeleton or in a frame, the shapes have a wrong size, or a clip of
-            AMASS has too few betas.
+        ValueError: a required joint is missing in the skeleton or in a frame, the shapes have a wrong size, or a clip
+            of AMASS has too few betas.
     """
     if incomplete := [clip for clip in motion if np.isnan(clip.positions).any()]:
         raise ValueError(

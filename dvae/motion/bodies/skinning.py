@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ...constants import indices
+from ...options import Size, check
 from ..geometry.kinematics import forward
 
 RANK_TOLERANCE = 1e-5
@@ -35,7 +36,10 @@ class BodySource:
 
     path: str = ""
     fingerprint: str = ""
-    shapes: int = 8
+    shapes: Size = 8
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 class Body(nn.Module):

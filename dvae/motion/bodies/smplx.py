@@ -94,7 +94,10 @@ def reopen_body(source: BodySource) -> Body:
         ValueError: the file is not a body, or another one.
     """
     if not source.path:
-        return human()
+        body = human()
+        if body.source != source:
+            raise ValueError(f"{source} has no path, and is not the bundled person, {body.source}")
+        return body
     advice = (
         "runs do not contain body files, because their licences forbid to distribute them; restore the file "
         f"(fingerprint {source.fingerprint[:12]}…), or correct `schema.body.path` in config.json of the run"

@@ -48,6 +48,7 @@ from ...inference.diagnostics.posteriors import Descent, Posterior, posterior
 from ...options import Positive, check
 from ...program.conditional import evaluating, like
 from ..bodies import MARKERS, Body, vertex_error
+from ..bodies.fitting import is_from_file
 from .embodied import SHAPE
 from .frames import TimedFrames
 
@@ -254,6 +255,8 @@ class SegmentCompletion:
                 f"expected observations {SURFACES}, {POINTS} or {SPOTS}, with their moments (B, K) in {TIMES} or "
                 f"{FRAMES}; got {shapes}"
             )
+        if SPOTS in tensors:
+            _check_markers(body, self.markers)
         b, k = moments.shape
         trailing_shapes: dict[str, tuple[Any, ...]] = {
             **{TIMES: (k,), FRAMES: (k,), SHAPE: (body.parameters_of_shape,)},
@@ -411,6 +414,7 @@ def simulate_observations(
         observations = {FRAMES: torch.tensor(frames).to(x).expand(len(x), -1)}
     rotations, places = model.timed.poses(_at_moments(model.timed, x, observations)[0])
     if kind == SPOTS:
+        _check_markers(model.body, markers)
         positions = model.body.select_vertices(shape, rotations, places, torch.tensor(markers))
     else:
         positions = model.body(shape, rotations, places)[0]
@@ -419,6 +423,14 @@ def simulate_observations(
     observed = torch.rand(positions.shape[:-1], generator=generator) >= (0.0 if kind == SURFACES else gaps)
     observed &= next(iter(observations.values())).isfinite()[..., None]
     return {**observations, kind: torch.where(observed[..., None], positions, torch.nan)}
+
+
+def _check_markers(body: Body, markers: Sequence[int]) -> None:
+    """Raise an error if the markers are the default ones, which are vertices of the bundled person, on another body."""
+    if tuple(markers) == tuple(MARKERS.values()) and is_from_file(body):
+        raise ValueError(
+            "the default markers are vertices of the bundled person; give the vertices of this body as `markers`"
+        )
 
 
 def sample_surfaces(vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator) -> Tensor:

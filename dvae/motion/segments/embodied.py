@@ -20,9 +20,10 @@ from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
 from ...data.views import Parts
 from ...options import tuples
-from ..bodies import Body, human, shapes_of
+from ..bodies import Body, BodySource, human, shapes_of
 from ..bodies.fitting import MOST, standing_heights
 from ..data.clips import MotionSet
+from ..files.smpl import JOINTS, PARENTS
 from ..geometry.skeleton import Skeleton, brief
 from ..geometry.views import HEADING
 from .frames import OFFSETS, ORIGIN, TimedFrames
@@ -33,8 +34,21 @@ SHAPE = "beta"
 
 
 @dataclass(frozen=True)
-class SegmentSchema(Schema):
-    """The schema of segments on the bundled body: frames x (B, N, D) and shape parameters beta (B, S).
+class BodySchema(Schema):
+    """The schema of shape parameters beta (B, S) of a body.
+
+    Args:
+        body: record of the body; default: the bundled person.
+    """
+
+    body: BodySource = field(default=BodySource(), kw_only=True)
+
+
+@dataclass(frozen=True)
+class SegmentSchema(BodySchema):
+    """The schema of segments on a body: frames x (B, N, D) and shape parameters beta (B, S).
+
+    A run stores the path and the fingerprint of a body's file, but not the body (`bodies.reopen_body`).
 
     Args:
         timed: conversion between segments of motion and frames.
@@ -47,9 +61,18 @@ class SegmentSchema(Schema):
 
     @classmethod
     def from_data(cls, timed: TimedFrames, body: Body) -> Self:
-        """Return the schema for these frames and for the shape parameters of a body."""
+        """Return the schema for these frames and for the shape parameters of a body.
+
+        Raises:
+            ValueError: the body was made in Python, so that a run could not reopen it.
+        """
+        if body.source is None:
+            raise ValueError(
+                "the body was made in Python, and a run could not reopen it; save its arrays with numpy.savez as "
+                "v_template, shapedirs, J_regressor, weights, kintree_table and f, and use bodies.read_body"
+            )
         sizes = {name: len(places) for name, places in timed.parts.items()}
-        return cls({**sizes, SHAPE: body.parameters_of_shape}, timed.frames, timed=timed)
+        return cls({**sizes, SHAPE: body.parameters_of_shape}, timed.frames, timed=timed, body=body.source)
 
     @property
     @override
@@ -60,28 +83,27 @@ class SegmentSchema(Schema):
     @override
     def windows(self) -> Schema:
         """Schema without the representation of frames; runs can share evaluation data if it is equal."""
-        return Schema({SHAPE: self.size(SHAPE)})
+        return BodySchema({SHAPE: self.size(SHAPE)}, body=replace(self.body, path=""))
 
     @override
     def config(self) -> dict[str, Any]:
         fields = asdict(replace(self.timed, references=()))
         references = [{**vars(reference), "hips": reference.hips.tolist()} for reference in self.timed.references]
-        return {"sizes": dict(self.sizes), "timed": {**fields, "references": references}}
+        return {"sizes": dict(self.sizes), "timed": {**fields, "references": references}, "body": asdict(self.body)}
 
     @classmethod
     @override
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        timed, body = dict(config["timed"]), human()
+        timed, body = dict(config["timed"]), BodySource(**config.get("body", {}))  # older runs have the bundled person
         references = tuple(map(_reference, timed.pop("references")))
         skeleton = Skeleton(**tuples(timed.pop("skeleton")))
-        if (skeleton.names, skeleton.parents, skeleton.up) != (body.names, body.parents, "y"):
-            raise ValueError(
-                f"timed.skeleton must be the skeleton of the bundled body, {', '.join(body.names)} with y up"
-            )
-        schema = cls.from_data(TimedFrames(skeleton, references=references, **tuples(timed)), body)
-        if config["sizes"] != schema.sizes:
-            raise ValueError(f"sizes are {brief(config['sizes'])}, expected {schema.sizes} for the frames in `timed`")
-        return schema
+        if (skeleton.names, skeleton.parents, skeleton.up) != (JOINTS, PARENTS, "y"):
+            raise ValueError(f"timed.skeleton must be the skeleton of bodies, {', '.join(JOINTS)} with y up")
+        frames = TimedFrames(skeleton, references=references, **tuples(timed))
+        sizes = {name: len(places) for name, places in frames.parts.items()} | {SHAPE: body.shapes}
+        if config["sizes"] != sizes:
+            raise ValueError(f"sizes are {brief(config['sizes'])}, expected {sizes} for the frames in `timed`")
+        return cls(sizes, frames.frames, timed=frames, body=body)
 
 
 def _reference(config: Mapping[str, Any]) -> Reference:
@@ -99,7 +121,7 @@ class Segments:
         motion: segments on the joints of the body, each a clip, e.g. from `bodies.fit_to_body` and `gait_cycles`.
         timed: conversion to frames; for test data, the conversion of the training data. Default: estimated from
             `motion`.
-        body: body with these joints; default: the bundled person.
+        body: body with these joints, such as one from `bodies.read_body`; default: the bundled person.
         frames: result of `timed.to(motion)`, if it was computed already.
         bodies: standard deviation of the shape parameters that `sample` draws in place of the segments' own; 0 keeps
             their own. Root positions scale with the length of the legs, as in `bodies.retarget`. A model trained on

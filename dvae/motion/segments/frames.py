@@ -353,12 +353,10 @@ class TimedFrames:
             x[rows] = self._resampled(
                 quaternions, positions[:, :, skeleton.root], frames, skeleton.fps, -heading[rows, None]
             )
-        if rotated := [
-            f"{name} ({float(a.rad2deg()):.0f}°)" for name, a in zip(self.still, left_out, strict=True) if a > CONSTANT
-        ]:
+        degrees = zip(self.still, left_out.rad2deg().tolist(), strict=True)
+        if rotated := [f"{name} (up to {angle:.0f}°)" for name, angle in degrees if np.deg2rad(angle) > CONSTANT]:
             warnings.warn(
-                f"frames do not contain the rotations of {', '.join(rotated)}; the angles are the largest ones. These "
-                "joints return with the identity rotation",
+                f"frames do not contain the rotations of {', '.join(rotated)}, which return as the identity",
                 stacklevel=3,
             )
         origin, offsets = first[:, skeleton.root], resting_offsets(motion)

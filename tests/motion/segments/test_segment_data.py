@@ -107,7 +107,7 @@ def test_takes_without_splits_are_assigned_to_one_split_each(count, tmp_path):
     ("change", "message"),
     [
         (lambda config: config["sizes"].update(turns=10**6), "sizes are .*, expected .* for the frames in `timed`"),
-        (lambda config: config["timed"]["skeleton"].update(up="z"), "must be the skeleton of the bundled body"),
+        (lambda config: config["timed"]["skeleton"].update(up="z"), "must be the skeleton of bodies, Pelvis"),
         (lambda config: config["timed"].update(frames=10**9), "frames is 1000000000; it must be"),
         (lambda config: config["timed"]["references"][0].update(hips=[[1, 0, 0, 0]]), "hips of a reference are"),
     ],
