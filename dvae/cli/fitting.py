@@ -366,7 +366,7 @@ def _use(name: str, run: Path) -> str:
         command = f"dvae forecast {run} --out FILE.csv --figure FILE.png"
         return f"{advice}\nforecast its test windows with: {command}\nand the future with: {command} --beyond"
     if methods()[name].fitted_on == "segments":
-        return f"{advice}\nrecover a segment from a part of it with: dvae impute {run} --from CLIP --seen markers"
+        return f"{advice}\nrecover a segment from a part of it with: dvae impute {run} --from CLIP --seen surfaces"
     if issubclass(methods()[name], TrajectoryMethod):
         return f"{advice} --joints JOINT …\nmove it with: dvae forecast {run} --joints JOINT … --out FILE.npz"
     return advice

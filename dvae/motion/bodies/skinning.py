@@ -24,6 +24,10 @@ RANK_TOLERANCE = 1e-5
 """Relative singular value below which joint offsets do not determine a shape parameter."""
 
 
+MOST_PAIRS = 16
+"""Maximum size of the summands of `Body.squared_error`, relative to the weighted surface of one body."""
+
+
 @dataclass(frozen=True)
 class BodySource:
     """Record of a body, for runs: they store which file a body is in, but never the body.
@@ -94,6 +98,7 @@ class Body(nn.Module):
                 raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {sizes} for {sizes_of_body}")
             self.register_buffer(name, tensor, persistent=False)
         self.names, self.parents, self.source = tuple(names), tuple(parents), source
+        self._summands: Tensor | None = None
 
     @property
     def parameters_of_shape(self) -> int:
@@ -222,8 +227,7 @@ class Body(nn.Module):
         """
         for motion in (first, second):
             self._check(shape, *motion)
-        surface = self._weighted(shape)
-        form = surface.mT @ surface / surface.shape[-2]
+        form = self._form(shape)
         pivots = self.joints_at_rest(shape)
         first_transforms, second_transforms = (
             _flat(_posed(pivots, rotations, self.parents)[0]) for rotations, _ in (first, second)
@@ -233,6 +237,27 @@ class Body(nn.Module):
         difference = torch.cat([difference[..., :3], difference[..., 3:] + translation[..., None, :]], -1).flatten(-2)
         errors: Tensor = ((difference @ form) * difference).sum(-1).unflatten(-1, (-1, 3)).sum(-1)
         return errors
+
+    def _form(self, shape: Tensor) -> Tensor:
+        """Return the matrix V V^T of `squared_error` divided by the number of vertices, (..., 4 J, 4 J).
+
+        Surfaces are linear in (1, beta), so the matrix is a sum over pairs of these S + 1 numbers. The summands are
+        computed once, and a step then does not depend on the number of vertices.
+        """
+        size, columns = self.parameters_of_shape + 1, 4 * self.joints
+        if size**2 * columns > MOST_PAIRS * len(self.template):  # with many parameters, vertices need less memory
+            surface = self._weighted(shape)
+            return surface.mT @ surface / surface.shape[-2]
+        if self._summands is None or (self._summands.dtype, self._summands.device) != (shape.dtype, shape.device):
+            points = torch.cat([self.template[..., None], self.shapes], -1).double()
+            ones = torch.eye(1, size).to(points).expand(len(points), 1, -1)
+            surfaces = (self.weights.double()[:, :, None, None] * torch.cat([points, ones], 1)[:, None]).flatten(1)
+            products = (surfaces.mT @ surfaces / len(points)).reshape(columns, size, columns, size)
+            self._summands = products.permute(1, 3, 0, 2).flatten(2).flatten(0, 1).to(shape)
+        factors = torch.cat([torch.ones_like(shape[..., :1]), shape], -1)
+        pairs = (factors[..., :, None] * factors[..., None, :]).flatten(-2)
+        form: Tensor = (pairs @ self._summands).unflatten(-1, (columns, columns))
+        return form
 
     def _weighted(self, shape: Tensor) -> Tensor:
         """Return homogeneous vertices at rest times their weight for each joint, (..., V, 4 J)."""

@@ -389,7 +389,9 @@ class TimedFrames:
         """Return the result of `_unscaled` with x in the units of this conversion, in single precision."""
         mean, deviation = self._scaling(unscaled[WHOLE])
         others = mean.new_tensor([self.metres] * 3 + [self.seconds / (self.frames - 1)])
-        x = (unscaled[WHOLE] - pad(mean, (0, 4))).div_(torch.cat([deviation, others]))
+        mean, deviation = pad(mean, (0, 4)), torch.cat([deviation, others])
+        # in parts, because a second array in double precision would be the largest one of all
+        x = torch.cat([((part - mean) / deviation).float() for part in unscaled[WHOLE].split(AT_ONCE // 16)])
         return {name: value.float() for name, value in {**unscaled, WHOLE: x}.items()}
 
     def _rotate_root(self, turn: Tensor, positions: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:

@@ -241,7 +241,9 @@ def test_a_file_larger_than_any_body_is_an_error(tmp_path, monkeypatch, limit, m
         read_body(tmp_path / "body.npz")
 
 
-def test_the_squared_error_equals_that_of_vertices_without_computing_them():
+@pytest.mark.parametrize("most", [0, 16], ids=["many parameters", "few parameters"])
+def test_the_squared_error_equals_that_of_vertices_without_computing_them(monkeypatch, most):
+    monkeypatch.setattr("dvae.motion.bodies.skinning.MOST_PAIRS", most)
     shape, *first = poses()
     _, *second = poses()
     difference = PERSON(shape, *first)[0] - PERSON(shape, *second)[0]
