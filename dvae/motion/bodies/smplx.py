@@ -56,6 +56,11 @@ def read_body(path: str | os.PathLike[str], shapes: int = 8) -> Body:
         ValueError: the file is damaged, too large, or not a body; or `shapes` is not between 1 and the file's number.
     """
     source, path = os.fspath(path), Path(path)
+    if path.suffix == ".pkl":
+        raise ValueError(
+            f"{path}: a pickle is a program, and is not read; use the npz of SMPL-H or SMPL-X, or save these members as "
+            f"plain arrays with numpy.savez: {', '.join(_MEMBERS)}"
+        )
     with archive(path) as members:
         if missing := [name for name in _MEMBERS if name not in members]:
             raise ValueError(

@@ -198,6 +198,8 @@ def test_files_that_do_not_fit_are_errors(folder, tmp_path):
         bodies.fit_to_body(takes, body)
     with pytest.raises(ValueError, match="betas is 6, but only a body in a file has a choice"):
         motion.SegmentData.open(folder / "amass", betas=6)
+    with pytest.raises(ValueError, match=r"SMPL_NEUTRAL\.pkl: a pickle is a program, and is not read"):
+        bodies.read_body("SMPL_NEUTRAL.pkl")
     with pytest.raises(FileNotFoundError, match=r"nobody\.npz"):
         motion.SegmentData.open(folder / "amass", body="nobody.npz")
 
