@@ -58,8 +58,8 @@ def read_body(path: str | os.PathLike[str], shapes: int = 8) -> Body:
     source, path = os.fspath(path), Path(path)
     if path.suffix == ".pkl":
         raise ValueError(
-            f"{path}: a pickle is a program, and is not read; use the npz of SMPL-H or SMPL-X, or save these members as "
-            f"plain arrays with numpy.savez: {', '.join(_MEMBERS)}"
+            f"{path}: a pickle is a program, and is not read; use the npz of SMPL-H or SMPL-X, or save these "
+            f"members as plain arrays with numpy.savez: {', '.join(_MEMBERS)}"
         )
     with archive(path) as members:
         if missing := [name for name in _MEMBERS if name not in members]:
