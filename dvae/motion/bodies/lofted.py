@@ -227,7 +227,7 @@ def human() -> Body:
         >>> float(tall[:, 1].max() - tall[:, 1].min()) > 1.8
         True
     """
-    return Body(JOINTS, PARENTS, *(tensor.clone() for tensor in _arrays()), BodySource(shapes=len(SHAPE)))
+    return Body(JOINTS, PARENTS, *(tensor.clone() for tensor in _arrays()), source=BodySource(shapes=len(SHAPE)))
 
 
 @cache

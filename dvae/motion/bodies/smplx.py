@@ -85,7 +85,7 @@ def read_body(path: str | os.PathLike[str], shapes: int = 8) -> Body:
     for tensor in tensors:
         digest.update(repr(tuple(tensor.shape)).encode())
         digest.update(tensor.numpy().tobytes())
-    return Body(JOINTS, PARENTS, *tensors, BodySource(source, digest.hexdigest(), shapes))
+    return Body(JOINTS, PARENTS, *tensors, source=BodySource(source, digest.hexdigest(), shapes))
 
 
 def reopen_body(source: BodySource) -> Body:

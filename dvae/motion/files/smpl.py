@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -116,7 +117,8 @@ def read_amass(path: str | Path) -> Recording:
     betas = arrays.get("betas", np.zeros(0)).reshape(-1)[:MOST_BETAS]
     labels = {"betas": " ".join(map(str, betas.tolist()))} if betas.size else {}
     if gender.size == 1:
-        name = gender.item() if gender.dtype.kind == "U" else gender.item().decode("ascii", "replace")
+        word: Any = gender.item()
+        name = word if isinstance(word, str) else word.decode("ascii", "replace")
         if not is_name(name):
             raise ValueError(f"{path}: gender is {brief(name)}, expected a word")
         labels["gender"] = name

@@ -320,8 +320,13 @@ class SegmentData:
         known = _sources(motion)
         sources = tuple(name for name in source.hold_out if name in known)
         motion = hold_out_sources(motion, sources) if sources else _divide(motion)
-        options = {"cut": source.cut, "skip_bad": source.skip_bad, "bodies": source.bodies, "hold_out": sources}
-        return cls(name, motion, seen=schema.timed, body=body, **options)
+        return cls(
+            *(name, motion, source.cut, source.skip_bad),
+            bodies=source.bodies,
+            seen=schema.timed,
+            body=body,
+            hold_out=sources,
+        )
 
     @cached_property
     def _training(self) -> Segments:
