@@ -81,6 +81,7 @@ class Body(nn.Module):
         regressor: Tensor,
         weights: Tensor,
         faces: Tensor,
+        *,
         source: BodySource | None = None,
     ):
         super().__init__()
