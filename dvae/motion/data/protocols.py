@@ -39,6 +39,7 @@ from ...options import Amount, Frames, Range, check, nearest, tuples
 from ..geometry.rotations import continuous, from_matrix, to_matrix
 from ..geometry.skeleton import Skeleton, rotate_about_up
 from ..geometry.views import ROTATIONS, Rotations
+from .actions import ACTION, GROUP, human36m_label
 from .clips import Clip, MotionSet
 
 Representation = Literal["positions", "6d", "quaternion", "vector"]
@@ -365,6 +366,9 @@ class Windows:
         frames = torch.tensor([clip.frames for clip in self.clips])
         self._first = frames.cumsum(0) - frames
         self._classes: dict[str, Tensor] = {}  # variable -> class of every clip
+        self._named: set[str] = set()  # labels that follow from the names of clips
+        if motion.skeleton.name == "human36m":
+            self._named = {ACTION, GROUP} - {label for clip in motion for label in clip.labels}
         self._given: Tensor | float | None = None  # set by `given`
         self._rows: Tensor | None = None  # set by `subset`
         self._reason = ""
@@ -498,19 +502,39 @@ class Windows:
         poses = torch.cat([self._represent(part[:, None], 0)[:, 0] for part in parts])
         return poses[poses.isfinite().all(-1)] if self.missing else poses
 
+    @property
+    def label_names(self) -> list[str]:
+        """Sorted names of the labels of the clips."""
+        return sorted(self._named.union(*(clip.labels for clip in self.clips)))
+
+    def clip_labels(self, name: str) -> list[str | None]:
+        """Return the label of every clip; None if it has none.
+
+        The labels "action" and "group" of Human3.6M follow from the names of its clips, unless the file has them
+        (`dvae.motion.data.actions`).
+
+        Args:
+            name: name of the label, such as "action".
+
+        Raises:
+            ValueError: the name of a clip of Human3.6M is not an action.
+        """
+        return [human36m_label(clip, name) if name in self._named else clip.labels.get(name) for clip in self.clips]
+
     def labels(self, name: str) -> list[str]:
-        """Return the label of every listed window's clip; an empty string if the clip has none.
+        """Return the label of every listed window's clip, as `clip_labels`; an empty string if the clip has none.
 
         Args:
             name: name of the label, such as "action".
 
         Raises:
             KeyError: no clip has such a label.
+            ValueError: the name of a clip of Human3.6M is not an action.
         """
-        if not any(name in clip.labels for clip in self.clips):
-            names = sorted({label for clip in self.clips for label in clip.labels})
-            raise KeyError(f"no clip has the label {name!r}; the labels are {', '.join(names) or 'none'}")
-        return [self.clips[c].labels.get(name, "") for c in self._list(self.stride)[0].tolist()]
+        if name not in self.label_names:
+            raise KeyError(f"no clip has the label {name!r}; the labels are {', '.join(self.label_names) or 'none'}")
+        labels = self.clip_labels(name)
+        return [labels[c] or "" for c in self._list(self.stride)[0].tolist()]
 
     def classified(self, variable: str, label: str, classes: Sequence[str]) -> Windows:
         """Return these windows with classes in their batches: {variable: (B,)} int64, indices of `classes`.
@@ -523,15 +547,16 @@ class Windows:
         Raises:
             ValueError: a clip does not have the label, or its value is not one of the classes.
         """
-        for clip in self.clips:
-            if (value := clip.labels.get(label)) not in classes:
+        labels = self.clip_labels(label)
+        for clip, value in zip(self.clips, labels, strict=True):
+            if value not in classes:
                 has = "has no label" if value is None else f"has {value!r} for"
                 raise ValueError(
                     f"clip {'/'.join(clip.key)} ({self.split}) {has} {label!r}, expected one of {', '.join(classes)}: "
                     "is labels.csv next to the file, does it list every clip, and do training clips have every class?"
                 )
         windows = copy(self)
-        indices = [classes.index(clip.labels[label]) for clip in self.clips]
+        indices = [classes.index(value) for value in labels]
         windows._classes = {**self._classes, variable: torch.tensor(indices)}
         return windows
 

@@ -44,7 +44,8 @@ class ActionClassifier(Trainable):
     """A classifier of actions, for the scores ACC and FID.
 
     Args:
-        label: name of the clip label that gives the class.
+        label: name of the clip label that gives the class; for Human3.6M also "action" or "group", the five groups of
+            the paper, which need no labels in the file.
         hidden: number of units of the GRU.
         layers: number of layers of the GRU.
         features: number of features.
@@ -73,13 +74,12 @@ class ActionClassifier(Trainable):
                 "an action classifier reads the classes from the labels of clips, but the data have no clips; pass "
                 "`dvae.motion.windows`"
             )
-        classes = sorted({clip.labels[self.label] for clip in windows.clips if self.label in clip.labels})
+        classes = sorted({label for label in windows.clip_labels(self.label) if label is not None})
         if len(classes) < 2:
-            labels = sorted({label for clip in windows.clips for label in clip.labels})
             raise ValueError(
                 f"a classifier needs at least two classes: training clips have {' and '.join(classes) or 'nothing'} "
                 f"for the label {self.label!r}; "
-                f"labels are {', '.join(labels) or 'none (is labels.csv next to the file?)'}"
+                f"labels are {', '.join(windows.label_names) or 'none (is labels.csv next to the file?)'}"
             )
         return replace(self, classes=tuple(classes))
 
