@@ -11,6 +11,8 @@
     step        a training step (16 windows, K motions each; forward, backward, Adam) in which the model reads its own
                 output, over one with true frames. "exact": step by step; "gradient": with gradients back in time;
                 "two passes": two parallel passes
+    draws       a training step with true frames at K = 50, the paper's number of motions, over one at K = 10: time, and
+                "draws, memory", the peak of its tensors
 
 Motion is simulated. Times are the shortest of several; the two sides of a ratio alternate.
 """
@@ -118,5 +120,18 @@ def rows(device: torch.device) -> dict[str, float]:
     forced, *sampled = seconds(step(None), *(step(feeding) for feeding in kinds.values()), repeat=3)
     numbers |= {f"step, {kind}": each / forced for kind, each in zip(kinds, sampled, strict=True)}
     numbers["step, seconds"] = forced
+
+    def drawn(samples: int) -> Callable[[], None]:
+        return fed_step(replace(method, samples=samples), model, windows, 16, device, draws={"w": samples})[0]
+
+    def peak_of_step(step: Callable[[], None]) -> int:
+        with TensorMemory() as memory:
+            step()
+        return memory.peak
+
+    few_motions, many_motions = drawn(10), drawn(50)
+    few_seconds, many_seconds = seconds(few_motions, many_motions, repeat=3)
+    numbers["draws"] = many_seconds / few_seconds
+    numbers["draws, memory"] = peak_of_step(many_motions) / peak_of_step(few_motions)
 
     return numbers

@@ -1,7 +1,7 @@
 """Masked cross-attention from the current step to the steps it may read (Vaswani et al., 2017, arXiv 1706.03762).
 
-Distances enter as linear biases (Press et al., 2022, arXiv 2108.12409) instead of absolute positions, so that a model
-can run on sequences longer than those in training.
+By default distances enter as linear biases (Press et al., 2022, arXiv 2108.12409) instead of absolute positions, so
+that a model can run on sequences longer than those in training.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from typing_extensions import override
 from ..constants import constant, indices, visible
 from ..factorization.relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, part
+from .cosine import positions
 from .extract import Extract, Extractors
 from .loop import Rows, each_at, select, valid_steps
 
@@ -29,8 +30,7 @@ from .loop import Rows, each_at, select, valid_steps
 class Attention:
     """An attention network: parents at single steps form the query, parents over ranges the keys and values.
 
-    The keys are masked as the factor declares. A learned start token is always visible, because the first step has no
-    past.
+    The keys are masked as the factor declares. The first step has no past and reads a learned start token.
 
     Args:
         width: width of queries, keys and values.
@@ -40,6 +40,9 @@ class Attention:
         activation: activation of the perceptrons.
         nearest: whether the query also contains the visible frame nearest to t of each parent over a range. Without
             it, the query is the same at every step if no parent is read at a single step.
+        positions: how the order enters: as linear "biases" of distances, or as "sinusoids" that are added to queries
+            and tokens (Vaswani et al., 2017).
+        start: whether all steps read the start token; otherwise only steps without a past do.
         extract: extractors by parent, applied first: widths of a perceptron, or the specification of another module,
             such as `NodeGraph()`.
     """
@@ -50,6 +53,8 @@ class Attention:
     feedforward: int = 0
     activation: str = "gelu"
     nearest: bool = True
+    positions: Literal["biases", "sinusoids"] = "biases"
+    start: bool = True
     extract: Extract = field(default_factory=dict)
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> AttentionNetwork:
@@ -72,12 +77,12 @@ class SelfAttention(Attention):
 
     It is for a local variable that reads parents over {1:T}; over {<=t} or {>=t} the attention is one-sided. All other
     parents, such as the variable's own past, are read after the encoder by `Attention`, with the frame's token in the
-    query. Heads alternately prefer the past and the future: in the bias of a head, distances to its other side count
-    four times.
+    query. With biases, heads alternately prefer the past and the future: in the bias of a head, distances to its other
+    side count four times.
 
     Args:
-        width, heads, layers, feedforward, activation, nearest, extract: as in `Attention`; `layers` is the number of
-            layers of the encoder, and of the attention after it.
+        width, heads, layers, feedforward, activation, nearest, positions, start, extract: as in `Attention`; `layers`
+            is the number of layers of the encoder, and of the attention after it.
     """
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> SelfAttentionNetwork:  # type: ignore[override]
@@ -194,7 +199,8 @@ class AttentionNetwork(Network):
 
     def __init__(self, spec: Attention, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, spec.width)
-        self.heads = spec.heads
+        self.heads, self.start_is_visible = spec.heads, spec.start
+        self.sinusoids = local and spec.positions == "sinusoids"
         self.extractors = Extractors(self.inputs, spec.extract, spec.activation)
         self.points: list[tuple[Input, int | None]] = []
         self.ranged: list[Input] = []
@@ -215,16 +221,18 @@ class AttentionNetwork(Network):
         if self.ranged:
             self.start_token = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
         self.embed = nn.ModuleDict({p.name: nn.Linear(p.size, spec.width) for p in self.ranged})
-        self.narrow = len(self.ranged) == 1 and self.ranged[0].size + 2 < spec.width
+        self.narrow = len(self.ranged) == 1 and self.ranged[0].size + 2 < spec.width and not self.sinusoids
         sizes = [parent.size for parent, _ in self.points]
         self.point = Join(sizes, (spec.width, spec.width), spec.activation) if sizes else None
         self.origin = nn.Parameter(torch.randn(spec.width) / math.sqrt(spec.width))
         self.layers: Any = nn.ModuleList(Layer(spec) for _ in range(spec.layers if self.ranged else 0))
         self.norm = nn.LayerNorm(spec.width)
-        self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
+        self.register_buffer("slopes", _slopes(spec.heads) * (not self.sinusoids), persistent=False)
 
     def bias(self, parent: Input, length: int) -> Tensor:
         """Return the attention bias for a parent: minus slope times distance at visible steps, -inf at others.
+
+        With sinusoids, slopes are 0.
 
         It is (heads, T, T); for a static child it is (1, 1, T), without distances.
         """
@@ -271,6 +279,8 @@ class AttentionNetwork(Network):
     def queries(self, parents: Mapping[str, Tensor], batch: int, length: int) -> Tensor:
         """Return the first stream, computed from the parents at single steps: (B, T, W), or (B, 1, W) if static."""
         stream = self.origin.expand(batch, length if self.local else 1, -1)
+        if self.sinusoids:
+            stream = stream + self.waves(length)
         if self.point is None:
             return stream
         query: Tensor = self.point([part(parents[parent.name], lag) for parent, lag in self.points])
@@ -288,8 +298,13 @@ class AttentionNetwork(Network):
             lengths: (B,) number of valid steps of each sequence, or None.
         """
         tokens = [self.embed[parent.name](values[parent.name]) for parent in parents]
-        bias = functional.pad(self.biases(parents, length, lengths), (1, 0))
-        return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), bias
+        if self.sinusoids:
+            tokens = [token + self.waves(length) for token in tokens]
+        return torch.cat([self.start_token.expand(batch, 1, -1), *tokens], dim=1), self.biases(parents, length, lengths)
+
+    def waves(self, length: int) -> Tensor:
+        """Return the sinusoids (T, W) of the steps."""
+        return positions(length, self.features, self.origin.dtype, self.origin.device)
 
     def kept(self, name: str, values: Tensor) -> Tensor:
         """Return the stored form of a parent's values (..., D) in a loop: tokens (..., W), or a shorter form.
@@ -310,15 +325,18 @@ class AttentionNetwork(Network):
         return torch.cat([embed.weight.mT, embed.bias[None], self.start_token[None]])
 
     def biases(self, parents: Sequence[Input], length: int, lengths: Tensor | None) -> Tensor:
-        """Return the attention bias of every step for all parents, -inf at padding.
+        """Return the attention bias of every step for the start token and all parents, -inf at padding.
 
-        It is (B, heads, T, T * parents); B is 1 without `lengths`, and heads and T are 1 for a static child.
+        It is (B, heads, T, 1 + T * parents); B is 1 without `lengths`, and heads and T are 1 for a static child.
         """
         empty = self.slopes.new_zeros(len(self.slopes) if self.local else 1, length if self.local else 1, 0)
         bias = torch.cat([empty, *(self.bias(parent, length) for parent in parents)], dim=-1)[None]
-        if lengths is None:
-            return bias
-        return bias.masked_fill(~valid_steps(lengths, length).repeat(1, len(parents))[:, None, None], -math.inf)
+        if lengths is not None:
+            bias = bias.masked_fill(~valid_steps(lengths, length).repeat(1, len(parents))[:, None, None], -math.inf)
+        if self.start_is_visible:
+            return functional.pad(bias, (1, 0))
+        has_past = bias.isfinite().any(-1, keepdim=True)
+        return torch.cat([torch.zeros_like(bias[..., :1]).masked_fill(has_past, -math.inf), bias], dim=-1)
 
     @override
     def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
@@ -331,8 +349,10 @@ class AttentionNetwork(Network):
         if self.ranged:
             first = self.start_token if columns is None else functional.pad(columns.new_ones(1), (len(columns) - 1, 0))
             stored = [self.kept(parent.name, parents[parent.name]) for parent in fixed]
+            if self.sinusoids:
+                stored = [tokens + self.waves(length) for tokens in stored]
             tokens = torch.cat([first.expand(batch, 1, -1), *stored], dim=1)
-            bias = functional.pad(self.biases([*fixed, *live], length, lengths), (1, 0))
+            bias = self.biases([*fixed, *live], length, lengths)
         return Attending(
             queries=queries,
             points=[entry for i, entry in enumerate(self.points) if i not in known_points],
@@ -354,6 +374,9 @@ class AttentionNetwork(Network):
     def step(self, state: Attending, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         samples = self.extractors.drawn(state.extracted, samples, state.lengths) if self.extractors else samples
         stream = self.origin.expand(state.batch, -1)
+        waves = self.waves(state.length) if self.sinusoids else None
+        if waves is not None:
+            stream = stream + waves[t]
         parts = each_at(samples, state.points, t, stream)
         if state.queries is not None and self.point is not None:
             stream = stream + self.point.add(state.queries, t, parts)
@@ -362,7 +385,8 @@ class AttentionNetwork(Network):
             for token in state.fresh(t):
                 i, s = divmod(token, state.length)
                 name = state.live[i].name
-                fresh.append(self.kept(name, samples[name][s]))
+                token_of_step = self.kept(name, samples[name][s])
+                fresh.append(token_of_step if waves is None else token_of_step + waves[s])
             if fresh:
                 state.cache.append(fresh)
             bias = state.row(t)
@@ -400,7 +424,8 @@ class SelfAttentionNetwork(Network):
         self.embed = nn.Linear(sum(tokens), spec.width)
         self.layers: Any = nn.ModuleList(Layer(spec) for _ in range(spec.layers))
         self.norm = nn.LayerNorm(spec.width)
-        self.register_buffer("slopes", _slopes(spec.heads), persistent=False)
+        self.sinusoids = spec.positions == "sinusoids"
+        self.register_buffer("slopes", _slopes(spec.heads) * (not self.sinusoids), persistent=False)
         spec_after = replace(spec, extract={n: e for n, e in spec.extract.items() if n in [p.name for p in others]})
         token = Input(ENCODED, spec.width, Relation.parse("t"))
         self.after = AttentionNetwork(spec_after, [token, *others], local) if others else None
@@ -416,6 +441,8 @@ class SelfAttentionNetwork(Network):
         values = self.extractors.of(parents, lengths)
         frames = torch.cat(aligned([values[p.name] for p in (*self.encoded, *self.statics)]), dim=-1)
         stream: Tensor = self.embed(frames)
+        if self.sinusoids:
+            stream = stream + positions(length, stream.shape[-1], stream.dtype, stream.device)
         bias = self.bias(length)
         if lengths is not None:
             bias = bias.masked_fill(~valid_steps(lengths, length)[:, None, None], -math.inf)

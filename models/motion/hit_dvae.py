@@ -42,14 +42,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
+import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
 from ...constants import indices
 from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema
-from ...distributions import Directions
+from ...distributions import Directions, DistributionSpec
 from ...factorization.notation import Factorization
+from ...inference.bounds.elbo import Terms
 from ...inference.training.objectives import Evidence, Objective
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
@@ -82,6 +84,26 @@ NETWORKS = table(
 PRESETS = {skeleton: options | NETWORKS[skeleton] for skeleton, options in ENERGIES.items()}
 """Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
 
+OURS: dict[str, Any] = {
+    "residual": 0.5,
+    "nearest": True,
+    "standardise": True,
+    "start_token": True,
+    "positions": "biases",
+    "feed_observed": False,
+}
+PAPER: dict[str, Any] = {
+    "residual": 0.0,
+    "nearest": False,
+    "standardise": False,
+    "start_token": False,
+    "positions": "sinusoids",
+    "feed_observed": True,
+    "emission": "unit",
+}
+PUBLISHED = {skeleton: PRESETS[skeleton] | PAPER | {"samples": 50} for skeleton in ("human36m", "humaneva")}
+"""The published model by skeleton (`HiTDVAE.published`); other skeletons have the values of HumanEva-I."""
+
 PARTS = ("lower", "upper")
 FRAMES = 15
 """Number of observed frames if no windows define it."""
@@ -95,7 +117,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         emission: distribution of x. loss="best-of-many" does not support "normal" and "student". With `bones`, x is a
             point mass.
         loss: "best-of-many" (the paper's) or "evidence" (the plain bound).
-        samples: K, number of motions drawn for each window in training; 1 with loss="evidence".
+        samples: K, number of motions drawn for each window in training; 1 with loss="evidence". The paper's is 50,
+            whose step takes MEMORY times the memory and TIME times the time of 10.
         kl_local: weight of the KL of z.
         kl_static: weight of the KL of w, in the unit of the bound; the paper's .1, which multiplies means over T
             frames, is .1 T.
@@ -109,6 +132,10 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             the keys.
         standardise: whether networks read and predict standardised poses, by the mean pose and one scale
             (`dvae.data.units`).
+        start_token: whether all steps may attend to a learned token and x_1 is part of the loss. Otherwise, as in the
+            paper, motions begin with the given x_1, and the loss of best-of-many begins at x_2 and z_2.
+        positions: "biases" of distances, for motions longer than in training, or the transformer's "sinusoids".
+        published: whether unset options and the training have the paper's values (`PUBLISHED`) instead of ours.
         pose_width: features of a joint, by graph convolutions; 0 for raw poses. By default 8 for windows of poses and
             0 for a model built from sizes alone.
         summary: network of w: "graph" (a graph of `frames` frames) or "attention" (over any length, ignoring the order:
@@ -117,7 +144,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             the same for all draws; otherwise it is the first frames.
         guide_past: whether the guide of z also reads z_{<t}.
         feed_observed: whether scheduled sampling may also replace observed frames, so that motions depend only on their
-            latents. The paper leaves this open.
+            latents. The paper's proportion of generated frames rises to 100 % (section 3.3), without an exception.
         feeding_passes: number of parallel passes that approximate the means that are fed back; 0 for exact means, step
             by step.
         feeding_gradient: whether gradients flow through these means.
@@ -137,7 +164,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         "humaneva": Training(7813, 64, 1e-3),
         "": Training(2400, 16, 2e-3, 0.8),
     }
-    residual: Share = 0.5
+    residual: Share | None = None  # type: ignore[assignment]
     scheduled_sampling: Share = 1.0
     warm_up: Delay | None = None
     loss: Literal["best-of-many", "evidence"] = "best-of-many"
@@ -150,13 +177,16 @@ class HiTDVAE(EnergyMethod, LatentMethod):
     heads_count: Size = 4
     decoder: Size | None = None
     layers: Layers = 1
-    nearest: bool = True
-    standardise: bool = True
+    nearest: bool | None = None
+    standardise: bool | None = None
+    start_token: bool | None = None
+    positions: Literal["biases", "sinusoids"] | None = None
+    published: bool = False
     pose_width: Extra | None = None
     summary: Literal["graph", "attention"] = "graph"
     frames: Size | None = None
     guide_past: bool = False
-    feed_observed: bool = False
+    feed_observed: bool | None = None
     feeding_passes: Extra = 0
     feeding_gradient: bool = False
 
@@ -201,11 +231,13 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         poses = {"x": NodeGraph(self.pose_width, coordinates=3)} if self.pose_width else {}
         decoder = self.decoder or PRESETS[""]["decoder"]
         shape: dict[str, Any] = {"heads": self.heads_count, "layers": self.layers, "extract": poses}
+        chosen = self.with_presets(self.unset)
+        order = {"nearest": chosen.nearest, "positions": chosen.positions, "start": chosen.start_token}
         networks: dict[str, NetworkSpec] = {}
         if self.attention:
-            networks["p(z)"] = Attention(self.width, nearest=self.nearest, **shape)
-            networks["p(x)"] = Attention(decoder, nearest=self.nearest, **shape)
-            networks["q(z)"] = SelfAttention(self.width, nearest=self.nearest, **shape)
+            networks["p(z)"] = Attention(self.width, **order, **shape)
+            networks["p(x)"] = Attention(decoder, **order, **shape)
+            networks["q(z)"] = SelfAttention(self.width, **order, **shape)
         else:
             networks["p(z)"] = networks["q(z)"] = Recurrent(self.width, layers=self.layers, extract=poses)
             networks["p(x)"] = Recurrent(decoder, layers=self.layers, hidden=(decoder,), extract=poses)
@@ -216,6 +248,11 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         return networks
 
     @override
+    def distributions(self) -> dict[str, DistributionSpec]:
+        """Return the distributions of x and, unless `prior` is "standard", of w."""
+        return dict(super(HiTDVAE, self.with_presets(self.unset)).distributions())
+
+    @override
     def build(self, data: Any) -> DynamicalVAE:
         """Return the model; without a skeleton it has no energies, and x are numbers, not poses (`pose_width`).
 
@@ -223,7 +260,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             ValueError: if the poses have a root and the method uses energies or headings.
         """
         schema = Schema.of(data)
-        method, observed = self, self.frames or FRAMES
+        method, observed = self.with_presets(self.unset), self.frames or FRAMES
         if self.bones or isinstance(schema, Poses):
             schema = Poses.of(schema, self.name)
             method, observed = self.resolve_defaults(schema), schema.protocol.observed
@@ -241,11 +278,28 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         if method.pose_width:
             for side in (model.generator, model.encoder):
                 share("x", *(conditional.network for conditional in side.values() if conditional.network is not None))
-        if self.standardise and not schema.units:
+        if method.standardise and not schema.units:
             model.standardise(WHOLE)
-        protected = 0 if self.feed_observed else observed
+        protected = observed if not method.feed_observed else 0 if method.start_token else 1
         model.feeding = ScheduledSampling(0.0, self.feeding_passes or None, self.feeding_gradient, protected)
         return model
+
+    @property
+    def unset(self) -> Mapping[str, Any]:
+        """Values of options that are None and do not depend on the skeleton."""
+        return PAPER if self.published else OURS
+
+    @override
+    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
+        """Return the values of options that are None, for poses of this skeleton."""
+        if self.published:
+            return PUBLISHED.get(skeleton.name, PUBLISHED["humaneva"])
+        return OURS | super().preset(skeleton)
+
+    @override
+    def training(self, data: Any) -> Training:
+        """Return the default training options for these data."""
+        return self.trainings.get(Schema.of(data).preset, self.trainings["humaneva" if self.published else ""])
 
     @override
     def resolve_defaults(self, data: Any) -> HiTDVAE:
@@ -258,14 +312,14 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         method = replace(self, frames=self.frames or schema.protocol.observed)
         if self.loss == "evidence":
             preset = self.preset(schema.skeleton)
-            unset = {name: preset[name] for name in ("decoder", "pose_width") if getattr(self, name) is None}
-            return replace(method, heading=bool(self.heading), **unset)
+            shapes = {name: preset[name] for name in ("decoder", "pose_width")}
+            return replace(method, heading=bool(self.heading)).with_presets(self.unset | shapes)
         return super(HiTDVAE, method).resolve_defaults(schema)
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """Return one stage of the paper's objective, or of the evidence, with warm-up and scheduled sampling."""
-        method = self.resolve_defaults(train) if self.loss == "best-of-many" else self
+        method = self.resolve_defaults(train) if self.loss == "best-of-many" else self.with_presets(self.unset)
         if self.warm_up is None:
             method = replace(method, warm_up=round(0.04 * steps))
         stages = [Stage(steps, method.objective())]
@@ -309,7 +363,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         ramp = SHAPES[self.warm_up_shape]
         diversity = {f"diversity_{part}": weight for part, weight in zip(PARTS, self.diversity, strict=True)}
         energy_weights = {name: getattr(self, name) for name in EnergyMethod.weights if name != "diversity"} | diversity
-        return Evidence(
+        return (Evidence if self.with_presets(self.unset).start_token else LaterEvidence)(
             kl_weight={n: ramp(0.0, w, steps=self.warm_up) if self.warm_up else w for n, w in weights.items()},
             free_bits=self.free_bits,
             energy_weights={name: weight for name, weight in energy_weights.items() if weight},
@@ -317,6 +371,23 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             draws={"w" if self.static else "z": self.samples},
             select="loss",
         )
+
+
+class LaterEvidence(Evidence):
+    """`Evidence` without the terms of the first step, which is given; still divided by all T steps, as the paper's."""
+
+    @override
+    def loss(self, terms: Terms, weights: Mapping[str, Any]) -> Tensor:
+        later = {name: values[:, 1:].sum(-1) for name, values in terms.steps.items()}
+        likelihood, kl = (
+            {name: later.get(name, value) for name, value in table.items()}
+            for table in (terms.log_likelihood, terms.kl)
+        )
+        return super().loss(replace(terms, log_likelihood=likelihood, kl=kl), weights)
+
+    @override
+    def to_config(self) -> dict[str, Any]:
+        return {**super().to_config(), "objective": type(self).__name__}
 
 
 class HiTModel(EnergyModel):
@@ -343,10 +414,11 @@ class HiTModel(EnergyModel):
             )
         size = rollout.batch // rollout.draws
         x = rollout.values[WHOLE]
-        predicted = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size))
-        truth, motions = (
-            self.positions({WHOLE: values}, data)[WHOLE] for values in (self.seen(x[:size], data), predicted)
-        )
+        predicted, seen = rollout.parameters(WHOLE, x)[0].unflatten(0, (-1, size)), self.seen(x[:size], data)
+        if not self.method.start_token:  # motions begin with the given frame
+            first = torch.where(seen[:, :1].isfinite(), seen[:, :1], predicted[:, :, :1])
+            predicted = torch.cat([first, predicted[:, :, 1:]], 2)
+        truth, motions = (self.positions({WHOLE: values}, data)[WHOLE] for values in (seen, predicted))
         means = self.realism(motions, truth, motions)
         method = self.method
         for part, weight, scale in zip(PARTS, method.diversity, method.diversity_scale, strict=True):

@@ -115,6 +115,12 @@ class TestHiTDVAEWithPastInTheGuide(Contract):
     missing: ClassVar = {}
 
 
+class TestPublishedHiTDVAE(Contract):
+    name = "hit-dvae"
+    options: ClassVar = {"published": True}
+    missing: ClassVar = {"z": ("z_{<t}",)}
+
+
 class TestStandardised(Contract):
     """Standardised variables, inside and outside of loops; distributions keep the unit of the variable."""
 

@@ -28,6 +28,7 @@ NETWORKS = {
     "attention": Attention(8, heads=2),
     "attention, two layers": Attention(8, heads=4, layers=2, feedforward=6),
     "attention, extracted": Attention(8, heads=2, nearest=False, extract={"z": NodeGraph(2), "x": (3,), "w": (4,)}),
+    "attention, sinusoids": Attention(8, heads=2, layers=2, nearest=False, positions="sinusoids", start=False),
     "lstm, poses": Recurrent(4, extract={"z": NodeGraph(2), "x": NodeGraph(2)}, hidden=(5,)),
     "dense": Dense((5, 4)),
 }
@@ -162,6 +163,43 @@ def test_attention_weights_are_those_of_the_layers():
         torch.testing.assert_close(weights.sum(-1), torch.ones(3, 2, T, dtype=torch.float64))
         assert (weights[..., : T + 1].masked_select(hidden) == 0).all()
         torch.testing.assert_close((weights @ layer.project(tokens)[1]).transpose(1, 2).flatten(2), output)
+
+
+def sinusoids(size):
+    """Return the position encodings of the first T steps by their formula."""
+    step, entry = np.ogrid[:T, :size]
+    phase = step / 10_000 ** (entry // 2 * 2 / size)
+    return torch.from_numpy(np.where(entry % 2, np.cos(phase), np.sin(phase)))
+
+
+def test_sinusoids_are_added_to_queries_and_tokens():
+    inputs = [Input("z", 2, Relation.parse("t")), Input("x", 3, Relation.parse("<t"))]
+    network = Attention(8, heads=2, positions="sinusoids").build(inputs, True, 2).double()
+    parents, plain = draw(inputs, 3), Attention(8, heads=2).build(inputs, True, 2).double()
+    plain.load_state_dict(network.state_dict())
+    queries, without = (each.queries(parents, 3, T) for each in (network, plain))
+    torch.testing.assert_close(queries - without, sinusoids(8).expand(3, T, 8))
+    (tokens, bias), (without, _) = (each.tokens(each.ranged, parents, 3, T, None) for each in (network, plain))
+    torch.testing.assert_close(tokens[:, 1:] - without[:, 1:], sinusoids(8).expand(3, T, 8))
+    assert {*bias.unique().tolist()} == {0.0, -np.inf}
+
+
+def test_an_encoder_adds_sinusoids_to_its_tokens():
+    inputs = [Input("x", 3, Relation.parse("1:T"))]
+    network = SelfAttention(8, heads=2, positions="sinusoids").build(inputs, True, 2).double()
+    parents = draw(inputs, 3)
+    (layer,) = network.layers
+    stream = network.embed(parents["x"]) + sinusoids(8)
+    keys, values = layer.project(layer.norm_query(stream))
+    expected = network.norm(layer(stream, keys, values, torch.zeros(T, T, dtype=torch.float64)))
+    torch.testing.assert_close(network(parents, T), expected)
+
+
+def test_only_the_first_step_reads_a_start_token_that_others_do_not():
+    inputs = [Input("z", 2, Relation.parse("t")), Input("x", 3, Relation.parse("<t"))]
+    network = Attention(8, heads=2, start=False).build(inputs, True, 2).double()
+    (weights,) = network.attention(draw(inputs, 3), T)
+    torch.testing.assert_close(weights[:, :, :, 0], (torch.arange(T) == 0).double().expand(3, 2, T))
 
 
 @pytest.mark.parametrize("steps", [1, 6])

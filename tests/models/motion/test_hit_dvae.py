@@ -9,10 +9,13 @@ from pyro import poutine
 
 import dvae
 from dvae import motion
-from dvae.models.motion.hit_dvae import PRESETS, HiTModel
+from dvae.distributions import FixedNormal
+from dvae.models.motion.hit_dvae import OURS, PRESETS, PUBLISHED, HiTModel
 from dvae.models.registry import configured
+from dvae.motion.data.protocols import Poses
 from dvae.motion.geometry.parts import body_parts
 from dvae.motion.scoring import energies
+from dvae.networks import FrameGraph, NodeGraph
 from dvae.runs import directory as runs
 
 SMALL = {"latent": 3, "static": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "samples": 3}
@@ -23,6 +26,7 @@ ABLATIONS = {
     "with its past, attention-pooled": {"guide_past": True, "summary": "attention"},
     "queries as in the paper, of poses as they are": {"nearest": False, "pose_width": 0},
     "evidence, turned": {"loss": "evidence", "heading": True},
+    "published": {"published": True},
 }
 ENERGIES = {"samples": None, "pose_prior": None, "angles": None, "multimodal": None}
 
@@ -101,9 +105,14 @@ def test_the_equations_are_those_of_the_paper_and_its_ablations():
 # -------------------------------------------------------------------------------------------------- the objective
 
 
-def test_the_loss_equals_the_one_of_the_paper(windows):
-    """The terms of L are means over time and sums over coordinates, computed window by window."""
+@pytest.mark.parametrize("published", [False, True])
+def test_the_loss_equals_the_one_of_the_paper(windows, published):
+    """The terms of L are means over time and sums over coordinates, computed window by window.
+
+    In the published model x_1 is given, and the KL of z begins at z_2.
+    """
     options = {"angles": 2.0, "multimodal": 3.0, "heading": True, "warm_up": 0, "pseudo_minimum": 0.0}
+    options["published"] = published
     model, batch = build(windows, **options).eval(), batch_of(windows, **options)
     assert batch["valid"].any()
     result, objective = terms(model, batch)
@@ -118,6 +127,9 @@ def test_the_loss_equals_the_one_of_the_paper(windows):
     repeated = {"x": batch["x"].repeat(K, 1, 1)}
     program = poutine.trace(poutine.condition(model.model, data={"z": z, "w": w})).get_trace(repeated).nodes
     motions = program["x"]["fn"].steps(x.repeat(K, 1, 1)).loc.unflatten(0, (K, B))
+    first = int(published)
+    if published:
+        motions = torch.cat([x[None, :, :1].expand(K, -1, -1, -1), motions[:, :, 1:]], 2)
 
     def kl(name):
         p, q = (nodes[name]["fn"] for nodes in (program, sites))
@@ -135,7 +147,9 @@ def test_the_loss_equals_the_one_of_the_paper(windows):
     pairs = batch["valid"].nonzero().tolist()
     best = [min(((motions[k, b] - pseudo[b, m]) ** 2).sum(-1).mean() for k in range(K)) for b, m in pairs]
     L += method.multimodal * torch.stack(best).mean()
-    L += method.kl_local * kl("z").sum(-1).mean(-1).mean() + method.kl_static / T * kl("w").sum(-1).mean()
+    L += (
+        method.kl_local / T * kl("z")[:, :, first:].sum((-2, -1)).mean() + method.kl_static / T * kl("w").sum(-1).mean()
+    )
     lengths, true_lengths = (windows.skeleton.bone_lengths(windows.positions(v)) for v in (motions, x[:, :1]))
     L += method.limb * ((lengths - true_lengths) ** 2).sum(-1).mean()
     for (part, joints), weight, scale in zip(
@@ -151,7 +165,7 @@ def test_the_loss_equals_the_one_of_the_paper(windows):
         L += weight * torch.stack(similarities).mean()
     limits = motion.AngleLimits(model.limits, model.angle_low, model.angle_high)
     L += method.angles * energies.joint_angles(motions, limits, windows.skeleton).mean()
-    L -= 1e-3 * program["x"]["fn"].log_prob(x.repeat(K, 1, 1)).mean() / T  # fits only the scale
+    L -= 1e-3 * program["x"]["fn"].by_step(x.repeat(K, 1, 1))[:, first:].sum(1).mean() / T  # fits only the scale
     torch.testing.assert_close(objective(result, 0), L, rtol=1e-9, atol=1e-9)
 
 
@@ -168,6 +182,69 @@ def test_the_presets_have_the_weights_of_the_paper(skeleton, frames, card):
     names = ("reconstruction", "multimodal", "diversity_lower", "diversity_upper", "limb", "angles", "pose_prior")
     weights = [objective.energy_weights[name] for name in names]
     assert [*weights, objective.kl_weight["z"], objective.kl_weight["w"] / frames] == pytest.approx(card)
+
+
+@pytest.mark.parametrize(
+    ("skeleton", "name", "batch", "steps", "frames", "observed", "scales", "weights"),
+    [
+        (motion.HUMAN36M, "h36m", 32, 15_625, 125, 25, (100, 300), (20, 10, 0.1, 0.2, 100, 1, 0.01, 0.5, 0.1)),
+        (motion.HUMANEVA, "humaneva", 64, 7813, 75, 15, (15, 50), (10, 5, 0.1, 0.2, 100, 1, 0.001, 0.5, 0.1)),
+    ],
+)
+def test_the_published_preset_has_the_values_of_the_paper(
+    skeleton, name, batch, steps, frames, observed, scales, weights
+):
+    """Sections 3.1.1, 3.3, 4.1.1 and 4.2, and appendix A."""
+    schema = Poses.from_data(motion.PROTOCOLS[name], skeleton)
+    assert (schema.frames, schema.protocol.observed) == (frames, observed)
+    method = dvae.method("hit-dvae", published=True).resolve_defaults(schema)
+    training = method.training(schema)
+    assert (training.batch_size, training.learning_rate, training.decay, training.optimizer) == (batch, 1e-3, 0, "adam")
+    assert training.steps == steps == math.ceil(500 * 1000 / batch)
+    assert method.sizes() == {"w": 32, "z": 16}
+    objective = replace(method, warm_up=0).objective()
+    assert objective.draws == {"w": 50}
+    names = ("reconstruction", "multimodal", "diversity_lower", "diversity_upper", "limb", "angles", "pose_prior")
+    values = [objective.energy_weights[name] for name in names]
+    assert [*values, objective.kl_weight["z"], objective.kl_weight["w"] / frames] == pytest.approx(weights)
+    assert method.diversity_scale == scales
+    networks = method.networks()
+    for factor, width in (("p(z)", 64), ("q(z)", 64), ("p(x)", 256)):
+        network = networks[factor]
+        assert (network.width, network.heads, network.feedforward or 4 * network.width) == (width, 4, 4 * width)
+        assert (network.nearest, network.start, network.positions) == (False, False, "sinusoids")
+        assert network.extract == {"x": NodeGraph(8, 1, 3)}
+    assert networks["q(w)"] == FrameGraph(observed, 64, 4, extract={"x": NodeGraph(8, 1, 3)})
+    assert method.distributions()["p(x)"] == FixedNormal()  # the identity as covariance, no residual
+    model = method.build(schema)
+    assert "x" not in model.units
+    assert model.feeding.start == 1
+    assert model.heading is None
+
+
+def test_published_values_yield_to_options_and_apply_to_other_skeletons(windows):
+    """Other skeletons have the values of HumanEva-I."""
+    humaneva = PUBLISHED["humaneva"]
+    method = dvae.method("hit-dvae", published=True).resolve_defaults(windows)
+    assert {name: getattr(method, name) for name in humaneva} == humaneva
+    assert method.training(windows) == method.trainings["humaneva"] != dvae.method("hit-dvae").training(windows)
+    changed = dvae.method("hit-dvae", published=True, residual=0.5, nearest=True, samples=10).resolve_defaults(windows)
+    assert changed == replace(method, residual=0.5, nearest=True, samples=10)
+    ours = dvae.method("hit-dvae").resolve_defaults(windows)
+    assert {name for name in OURS if getattr(ours, name) != getattr(method, name)} == {*OURS}
+
+
+def test_the_published_model_is_fitted_and_forecasts(people, tmp_path):
+    data = dvae.motion.MotionData.open(people)
+    small_networks = {"width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "samples": 3, "pose_prior": 0.0}
+    method = dvae.method("hit-dvae", published=True, **small_networks)
+    dvae.fit(
+        method, data, out=tmp_path / "run", steps=4, validate_every=2, batch_size=2, accelerator="cpu", progress=False
+    )
+    run = runs.load(tmp_path / "run")
+    assert run.method == method.resolve_defaults(data.windows("train"))
+    past = data.windows("test").all()["x"][:2, :15]
+    assert torch.isfinite(run.model.forecast(past, 80, 2)["x"]).all()
 
 
 def test_schedules_have_the_epochs_of_the_paper(windows):
