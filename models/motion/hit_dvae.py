@@ -11,28 +11,46 @@ The paper does not maximise the evidence. For each window it draws K motions fro
 
     L = lr min_k |x_k - x|^2 + lmm (the same to pseudo ground truths) + lz KL_z + lw KL_w + energies
 
-Errors are means over time, KL_w is a sum, and the energies of GSPS (diversity, limbs, angles, pose prior) cover all
-frames. Early in training, the model begins to read only its own output. The paper prints its squared errors as sums.
-We read them as means over time, because its weights then agree with the weights of GSPS; the meaning of the weights
-depends on this choice. Both objectives are available: loss="best-of-many" and loss="evidence".
+KL_w is a sum, and the energies of GSPS (diversity, limbs, angles, pose prior) cover all frames. Early in training, the
+model begins to read only its own output. The paper prints its squared errors as sums. We read them as means over time,
+because its weights then agree with the weights of GSPS; the meaning of the weights depends on this choice. Both
+objectives are available: loss="best-of-many" and loss="evidence".
 
-Bie et al., 2022, arXiv 2204.01565. There is no public code. Our choices where the paper gives no detail or did not
-work:
+K is the number of motions in the loss (sections 3.2.1 and 3.2.2, equations 11 and 15). Section 4.2 says "We generate
+K = 50 samples for each observation", between the sizes of the networks and the training. With the same symbol, this is
+the K of training. The sentence can also be read as the number of futures in the evaluation, which is the K of APD
+(section 4.1.2) and 50 in GSPS; then the paper does not state the K of training. `published` takes the first reading. A
+step with K = 50 takes 5.7 times the time and 4.8 times the memory of K = 10 (one core, 16 windows, true frames,
+`python -m benchmarks.bench hit_dvae`).
 
-* Each factor has one layer. Positions enter by linear biases (`networks.Attention`), so that motions may be longer than
-  in training. A learned start token replaces the past of the first step, so that x_1 and z_1 are part of the model.
-* The mean of x_t keeps half of x_{t-1} (`residual`). Without it, the error of the first predicted frame doubles; with
-  all of x_{t-1}, motions diverge. Poses are standardised: in metres, training takes several times as long to learn the
-  features that all poses share. There is no batch normalisation.
-* With best-of-many, the density of x has one scale per coordinate, which is only fitted to the errors: its gradient
-  does not reach the poses. emission="unit" gives the paper's unit variance.
-* On other data than the paper's, the weight of the KL of z is .03 instead of .5. With .5, z collapses in short runs and
-  motions lose their rhythm. The weight of the KL of w is .03 instead of 7.5; with 7.5, w carries no information
-  (docs/results/hit_dvae.md).
-* Training never replaces the observed frames, since a forecast does not either, unless `feed_observed` is set. No
-  gradient flows through means that are fed back, unless `feeding_gradient` is set. `feeding_passes` computes these
-  means in parallel.
-* A model may see windows rotated so that the last observed pose faces one way; on small data sets this is the default.
+Bie et al., 2022, arXiv 2204.01565. There is no public code. `published` is the model of the paper; ours differs because
+some of its choices did not work in short runs on small data sets:
+
+    option         published                          ours
+    samples        50                                 10; 6 on skeletons other than the paper's
+    residual       0                                  .5: the mean of x_t keeps half of x_{t-1}
+    nearest        False: frames are keys only        True: the last frame also joins the query
+    standardise    False: metres                      True
+    start_token    False: x_1 is given                True: x_1 and z_1 are part of the model
+    positions      sinusoids                          biases of distances
+    emission       unit: the identity as covariance   fixed: one scale per coordinate, fitted to the errors
+    feed_observed  True: all frames may be fed        False: observed frames stay true
+
+On skeletons other than the paper's, `published` has the values of HumanEva-I, and ours has smaller networks, rotated
+windows, KL weights of .03 for z and w, and 2,400 steps.
+
+* Without a residual, the error of the first predicted frame doubles; with all of x_{t-1}, motions diverge. In metres,
+  training takes several times as long to learn the features that all poses share. Biases of distances allow motions
+  longer than in training. A forecast does not replace the observed frames either.
+* With best-of-many, the scale of x is only fitted to the errors: its gradient does not reach the poses.
+* With the paper's weight of .5, z collapses in short runs and motions lose their rhythm. With 7.5 (.1 T), w carries no
+  information (docs/results/hit_dvae.md).
+
+The paper does not determine the rest, which is our choice in both: one layer per factor, normalised before attention,
+with GELU; positions (it cites the transformer, which has sinusoids); fed frames drawn one by one, without a gradient
+(`feeding_gradient`; `feeding_passes` computes the means in parallel); one draw of w per motion. Our graph convolutions
+have no batch normalisation, because features would depend on other sequences of the batch; the frames' have layer
+normalisation.
 """
 
 from __future__ import annotations
@@ -81,9 +99,6 @@ NETWORKS = table(
     "pose_width samples decoder pool_stride heading",
     {"humaneva": (8, 10, 256, 15, False), "human36m": (8, 10, 256, 20, False), "": (8, 6, 128, 10, True)},
 )
-PRESETS = {skeleton: options | NETWORKS[skeleton] for skeleton, options in ENERGIES.items()}
-"""Options by skeleton: the paper's values; for other skeletons, values for 15 observed + 60 predicted frames, 30 Hz."""
-
 OURS: dict[str, Any] = {
     "residual": 0.5,
     "nearest": True,
@@ -92,6 +107,9 @@ OURS: dict[str, Any] = {
     "positions": "biases",
     "feed_observed": False,
 }
+PRESETS = {skeleton: options | NETWORKS[skeleton] | OURS for skeleton, options in ENERGIES.items()}
+"""Options by skeleton, with the paper's weights; other skeletons: for 15 observed + 60 predicted frames, 30 Hz."""
+
 PAPER: dict[str, Any] = {
     "residual": 0.0,
     "nearest": False,
@@ -117,8 +135,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         emission: distribution of x. loss="best-of-many" does not support "normal" and "student". With `bones`, x is a
             point mass.
         loss: "best-of-many" (the paper's) or "evidence" (the plain bound).
-        samples: K, number of motions drawn for each window in training; 1 with loss="evidence". The paper's is 50,
-            whose step takes MEMORY times the memory and TIME times the time of 10.
+        samples: K, number of motions drawn for each window in training; 1 with loss="evidence".
         kl_local: weight of the KL of z.
         kl_static: weight of the KL of w, in the unit of the bound; the paper's .1, which multiplies means over T
             frames, is .1 T.
@@ -292,9 +309,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
     @override
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
         """Return the values of options that are None, for poses of this skeleton."""
-        if self.published:
-            return PUBLISHED.get(skeleton.name, PUBLISHED["humaneva"])
-        return OURS | super().preset(skeleton)
+        published = PUBLISHED.get(skeleton.name, PUBLISHED["humaneva"])
+        return published if self.published else super().preset(skeleton)
 
     @override
     def training(self, data: Any) -> Training:

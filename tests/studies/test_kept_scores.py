@@ -18,6 +18,9 @@ RUNS = [
     for run in dict.fromkeys(name.partition("/")[0] for name in ranking.archive(ranking.SCORES, of).names)
 ]
 
+LATER = {"published": False, "start_token": True, "positions": "biases"}
+"""Options that did not exist when stored runs were fitted, with the values that they had in effect."""
+
 
 def named(file):
     return "/".join(file.relative_to(ranking.SCORES).parts)
@@ -64,7 +67,7 @@ def test_scores_have_the_options_of_their_rows(of, run):
     for name, value in json.loads(json.dumps({**preset, **now})).items():
         if name.startswith("pseudo_") and stored["method"]["multimodal"] == 0:
             continue  # only the multimodal term reads it
-        assert stored["method"][name] == value, name
+        assert {**LATER, **stored["method"]}[name] == value, name
     now = {**vars(method.trainings[""]), **training}
     for name in ("steps", "batch_size", "learning_rate", "decay"):
         assert stored["training"][name] == now[name], name
