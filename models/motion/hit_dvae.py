@@ -249,7 +249,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         decoder = self.decoder or PRESETS[""]["decoder"]
         shape: dict[str, Any] = {"heads": self.heads_count, "layers": self.layers, "extract": poses}
         chosen = self.with_presets(self.unset)
-        order = {"nearest": chosen.nearest, "positions": chosen.positions, "start": chosen.start_token}
+        order: dict[str, Any] = {"nearest": chosen.nearest, "positions": chosen.positions, "start": chosen.start_token}
         networks: dict[str, NetworkSpec] = {}
         if self.attention:
             networks["p(z)"] = Attention(self.width, **order, **shape)
@@ -287,7 +287,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             if method.loss == "best-of-many":
                 distribution = replace(model_arguments["distributions"]["p(x)"], fitted="scale")
                 model_arguments["distributions"]["p(x)"] = (
-                    Directions(residual=method.residual) if method.bones else distribution
+                    Directions(residual=method.residual or 0.0) if method.bones else distribution
                 )
             model: DynamicalVAE = HiTModel(method, schema.skeleton, observed, **model_arguments)
         else:
@@ -329,7 +329,7 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         if self.loss == "evidence":
             preset = self.preset(schema.skeleton)
             shapes = {name: preset[name] for name in ("decoder", "pose_width")}
-            return replace(method, heading=bool(self.heading)).with_presets(self.unset | shapes)
+            return replace(method, heading=bool(self.heading)).with_presets({**self.unset, **shapes})
         return super(HiTDVAE, method).resolve_defaults(schema)
 
     @override
