@@ -20,7 +20,7 @@ K is the number of motions in the loss (sections 3.2.1 and 3.2.2, equations 11 a
 K = 50 samples for each observation", between the sizes of the networks and the training. With the same symbol, this is
 the K of training. The sentence can also be read as the number of futures in the evaluation, which is the K of APD
 (section 4.1.2) and 50 in GSPS; then the paper does not state the K of training. `published` takes the first reading. A
-step with K = 50 takes 5.7 times the time and 4.8 times the memory of K = 10 (one core, 16 windows, true frames,
+step with K = 50 takes 6.0 times the time and 4.9 times the memory of K = 10 (one core, 16 windows, true frames,
 `python -m benchmarks.bench hit_dvae`).
 
 Bie et al., 2022, arXiv 2204.01565. There is no public code. `published` is the model of the paper; ours differs because
