@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -39,6 +39,8 @@ OPTIONS: dict[str, Any] = {"width": 128, "scale": 0.01}
 TRAINING: dict[str, Any] = {"batch_size": 32, "learning_rate": 2e-3, "decay": 0.5}
 STEPS, SAMPLES, EVERY, THINNED = 1000, 50, 10, 4
 """Training steps, futures, stride over test windows, and further stride for errors of angles."""
+CHECKPOINTS = 500
+"""Largest number of steps between two checkpoints."""
 FUTURES = 500
 """Largest number of futures for the best error of angles of "mix, velocity"; SAMPLES for others."""
 WATCHED = 50
@@ -65,21 +67,25 @@ class Section:
         protocol: name of the window protocol.
         cases: options by name of the case.
         share: fraction of the training steps.
+        options: options of all cases, in place of `OPTIONS`.
+        training: options of training, in place of `TRAINING`.
+        steps: training steps of a run, in place of the fraction.
     """
 
     protocol: str
     cases: Mapping[str, Mapping[str, Any]]
     share: float = 1.0
+    options: Mapping[str, Any] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+    steps: int = 0
 
-    @property
-    def steps(self) -> int:
-        """Training steps of a run."""
-        return round(self.share * STEPS)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "steps", self.steps or round(self.share * STEPS))
 
 
 CASES = settings(__file__)
 SECTIONS = {
-    name: Section(each.get("protocol", name), CASES[each["cases"]], each.get("share", 1.0))
+    name: Section(**{"protocol": name, **each, "cases": CASES[each["cases"]]})
     for name, each in CASES["sections"].items()
 }
 NAMED, TUNING, RAW = CASES["ways"], "bandai2-tuning", "cmu-bvh"
@@ -118,13 +124,14 @@ def some_scores(windows: Any) -> list[Measure]:
 
 def measured(section: Section, data: motion.MotionData, case: str, seed: int, out: Path) -> dict[str, Any]:
     """Fit a case and score it by clip; runs of "mix" also score zero velocity."""
-    steps, method = section.steps, dvae.method("mix-and-match", **{**OPTIONS, **section.cases[case]})
+    steps, method = section.steps, dvae.method("mix-and-match", **{**OPTIONS, **section.options, **section.cases[case]})
     train, test = data.windows("train"), data.windows("test")
     fewer = test.with_protocol(replace(test.protocol, test_stride=THINNED * test.protocol.test_stride))
     some = torch.linspace(0, len(test) - 1, min(WATCHED, len(test))).long()
     past = test.all().past(test.protocol.observed).rows(some)
     watch = CodeDiversity(past, every=max(steps // 15, 1))
-    training = {**TRAINING, "steps": steps, "validate_every": max(steps // 3, 1), "callbacks": [watch]}
+    every = min(max(steps // 3, 1), CHECKPOINTS)  # checkpoints, from which an interrupted run continues
+    training = {**TRAINING, **section.training, "steps": steps, "validate_every": every, "callbacks": [watch]}
     fit = fit_or_load(method, data, train, out=out, seed=seed, **training)
     model, (watched, diversity) = fit.model.eval(), fit.series("codes/diversity")
     late = [row["kl/z"] for row in fit.history if "kl/z" in row and row["step"] > 0.9 * steps]
@@ -293,6 +300,7 @@ def main(
     sections: tuple[str, ...] = tuple(SECTIONS),
     cases: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0, 1, 2),
+    steps: int | None = None,
 ) -> None:
     """Fit, score, and write the tables.
 
@@ -305,8 +313,13 @@ def main(
         sections: sections to fit.
         cases: names of cases to fit; all cases of a section if empty.
         seeds: seeds of the runs to fit.
+        steps: other number of training steps of the sections to fit, whose runs and tables then have names with it.
     """
     torch.set_num_threads(1)
+    if steps:
+        changed = {f"{name}, {steps} steps": replace(SECTIONS[name], steps=steps) for name in sections}
+        SECTIONS.update(changed)
+        sections = tuple(changed)
     for name, section in ((name, SECTIONS[name]) for name in sections):
         if file := raw if section.protocol == RAW else data:
             run = partial(measured, section, data_of(section.protocol, file))

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import torch
 import tyro
 
 from .. import motion
@@ -15,8 +16,12 @@ from ..inference.evaluation.compare import compare as compare_models
 from ..inference.evaluation.evaluate import evaluate as evaluate_models
 from ..inference.evaluation.scores import Scores
 from ..inference.training.checkpoints import CheckpointError, Run
+from ..models.motion.codes import code_scores
 from ..models.motion.trajectories import TrajectoryModel
+from ..motion.geometry.euler import euler_errors
 from ..motion.metric_models.pose_prior import PosePriorModel
+from ..motion.metric_models.quality import RealOrGenerated, quality
+from ..motion.scoring.actions import action_windows, errors_by_action
 from ..runs import directory as runs
 from . import loading
 from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, note, save_figure
@@ -25,6 +30,8 @@ from .help import Expert
 
 MOST_REMEMBERED = 2**32
 """Maximum size in bytes of the training windows that references load; memory-mapped data may be larger."""
+OBSERVATIONS = 50
+"""Number of observations for the diversity of codes, as in the paper of Mix-and-Match."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +72,43 @@ class Control:
         return "-".join(parts if self.temperature is None else [*parts, f"temperature-{self.temperature:g}"])
 
 
+@dataclass(frozen=True)
+class Angles:
+    """Options of --measure angles.
+
+    Args:
+        inverse: estimate rotations from positions, for runs that predict positions.
+        actions: score the eight windows of each action of Human3.6M's benchmark, and print errors by action.
+    """
+
+    inverse: Expert[bool] = False
+    actions: bool = False
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Options of --measure quality; the defaults are the paper's (Mix-and-Match).
+
+    Args:
+        quality_width: units of the classifier that distinguishes real from generated motion.
+        quality_examples: number of training windows of each kind.
+        quality_steps: number of training steps.
+        quality_seeds: number of classifiers of each run.
+    """
+
+    quality_width: Expert[int] = 1024
+    quality_examples: Expert[int] = 25_000
+    quality_steps: Expert[int] = 5000
+    quality_seeds: Expert[int] = 3
+
+
 def evaluate(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     control: Control,
+    angles: Angles,
+    realism: Quality,
     data: str | None = None,
+    measure: Literal["forecasts", "quality", "angles", "codes"] = "forecasts",
     missing: Expert[Missing] = False,
     failed: Expert[Failed] = False,
     samples: int = 50,
@@ -88,12 +128,17 @@ def evaluate(
     dimension. Options for forecasts do not apply to them.
 
     Prints the table, and writes it with all settings to evaluation.json in each run, or to --out. With given joints,
-    several futures or other data, the file name says so. Nearest neighbours require the training data of the runs.
+    several futures, other data or another measure, the file name says so. Nearest neighbours require the training data
+    of the runs.
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
         control: joints whose true paths are given to methods that take trajectories.
+        angles: options of --measure angles.
+        realism: options of --measure quality.
         data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
+        measure: scores of forecasts; or, for motion, their quality (how hard they are to distinguish from real motion),
+            errors of their Euler angles (best of 1 and of K), or the diversity of the codes of mix-and-match.
         samples: number K of forecasts of each window.
         bound_particles: number of particles of the IWAE bound; 0 omits it.
         log_score_particles: number of particles of the log density of the future under the forecasts; 0 omits it.
@@ -114,6 +159,19 @@ def evaluate(
     scoring = ForecastScoring(
         samples, log_score_particles, pose_prior, classifier, control, missing, failed, several_futures
     )
+    chosen = [name for name, options in (("angles", angles), ("quality", realism)) if options != type(options)()]
+    if wrong := next((name for name in chosen if name != measure), None):
+        raise UsageError(f"options of --measure {wrong} do not apply to --measure {measure}; leave them out")
+    if measure != "forecasts":
+        if bound_particles or scoring != replace(ForecastScoring(samples), missing=missing, failed=failed):
+            raise UsageError(
+                f"--bound-particles, --log-score-particles, --pose-prior, --classifier, --joints, --exchange, "
+                f"--temperature and --several-futures do not apply to --measure {measure}; leave them out"
+            )
+        if figure is not None and measure != "angles":
+            raise UsageError(f"--measure {measure} has no figure; leave --figure out")
+        _measure(measure, run, data, scoring, angles, realism, out, figure, seed=seed, batch_size=batch_size)
+        return
     score = _segments if loading.kind_of(run, data) == "segments" else _forecasts
     result, record = score(run, data, scoring, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
     save_and_print(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
@@ -168,6 +226,62 @@ def _forecasts(paths: Sequence[Path], data: str | None, scoring: ForecastScoring
     )
     subset = "-several-futures" * scoring.several_futures
     return result, f"{loading.record('evaluation', loaded[0], data_set)}{scoring.control}{subset}"
+
+
+def _measure(
+    measure: str,
+    paths: Sequence[Path],
+    data: str | None,
+    scoring: ForecastScoring,
+    angles: Angles,
+    realism: Quality,
+    out: Path | None,
+    figure: Path | None,
+    seed: int,
+    batch_size: int,
+) -> None:
+    """Measure the quality, the Euler angles or the codes of runs on motion; print and write the result."""
+    if (kind := loading.kind_of(paths, data)) != "motion":
+        raise UsageError(f"--measure {measure} is for forecasts of motion, and {paths[0]} was fitted on {kind}")
+    loaded = loading.with_equal_windows(paths, data, ("motion",), scoring.failed)
+    data_set = loading.data_of(data, *loaded, missing=scoring.missing)
+    models = {name: run.model for name, run in zip(loading.names(loaded), loaded, strict=True)}
+    windows: Any = loading.windows_to_test(loaded[0], data_set, whole_sequences=False)
+    result: Any
+    tables: list[Any] = []
+    if measure == "quality":
+        if not loading.is_training_data(loaded[0], data_set):
+            raise UsageError(
+                "--measure quality needs the training windows of the runs; leave out --data with other data"
+            )
+        options = {"steps": realism.quality_steps, "examples": realism.quality_examples, "seed": seed}
+        at_least(1, **{f"quality_{name}": options[name] for name in ("steps", "examples")})
+        at_least(1, quality_width=realism.quality_width, quality_seeds=realism.quality_seeds)
+        classifier = RealOrGenerated(realism.quality_width)
+        seeds = range(realism.quality_seeds)
+        result = quality(models, data_set.windows("train"), windows, method=classifier, seeds=seeds, **options)
+    elif measure == "angles":
+        windows = action_windows(windows) if angles.actions else windows
+        counts = sorted({1, scoring.samples})
+        result = euler_errors(models, windows, counts=counts, inverse=angles.inverse, seed=seed, batch_size=batch_size)
+        if angles.actions:
+            tables = [
+                errors_by_action(result, windows, name, count)
+                for name, row in result.rows.items()
+                for count in (counts if row.samples > 1 else [1])
+            ]
+    else:
+        rows = torch.linspace(0, len(windows) - 1, min(OBSERVATIONS, len(windows))).long()
+        untrained = {}
+        for name, run in zip(models, loaded, strict=True):
+            torch.manual_seed(run.config.training.seed)
+            untrained[name] = run.method.build(run.schema)
+        past = windows.all().past(windows.protocol.observed).rows(rows)
+        result = code_scores(models, past, scoring.samples, seed, untrained)
+    record = f"{loading.record(measure, loaded[0], data_set)}{'-by-action' * angles.actions}.json"
+    save_and_print(result, [path / record for path in paths] if out is None else [out], figure)
+    for table in tables:
+        OUT.print(table)
 
 
 def _reference_windows(data_set: Any) -> Any:

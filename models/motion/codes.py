@@ -16,8 +16,10 @@ decoder ignores z. To measure the effect of z alone, draw the indices once for a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from typing_extensions import override
@@ -25,6 +27,8 @@ from typing_extensions import override
 from ...data.batch import WHOLE
 from ...inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from ...inference.evaluation.metrics import average_pairwise_distance
+from ...inference.evaluation.record import MODELS, Dims
+from ...inference.evaluation.result import Result, Table
 from ...inference.training.fit import Callback
 from ...inference.training.svi import State
 from ...program.batch import AnyBatch
@@ -80,6 +84,80 @@ def code_diversity(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
         raise ValueError(f"samples must be at least 2 to compare codes, got {samples}")
     diversity: Tensor = average_pairwise_distance(codes(model, batch, samples).movedim(0, 1)[:, :, None])
     return diversity
+
+
+CODES, SAME, UNTRAINED = "codes", "same indices", "untrained"
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class CodeScores(Result):
+    """The diversity of the codes of models, by observation.
+
+    Attributes:
+        rows: `{model: {score: values (N,)}}` for N observations: "codes"; "same indices", if the model draws random
+            variables that all codes can share; and "untrained", of the model before training, if it was given.
+        samples: K, number of codes of each observation.
+        seed: seed of the draws.
+    """
+
+    rows: Annotated[dict[str, Annotated[dict[str, np.ndarray], Dims("observation", name="{}")]], MODELS]
+    samples: int
+    seed: int
+
+    @override
+    def table(self) -> Table:
+        """Return means and standard deviations over observations, as in the paper's figure 1."""
+        number = len(next(iter(self.rows.values()))[CODES])
+        table = Table(
+            title=f"diversity of codes · {number} observations, K = {self.samples}",
+            caption="mean ± standard deviation over observations; compare values of one model only\n"
+            "same indices: indices are drawn once for all codes, so that only z differs",
+        )
+        for header in ("", UNTRAINED, "trained", SAME):
+            table.add_column(header, justify="right")
+        for name, scores in self.rows.items():
+            values = (scores.get(score) for score in (UNTRAINED, CODES, SAME))
+            table.add_row(name, *("–" if x is None else f"{x.mean():.2f} ± {x.std(ddof=1):.2f}" for x in values))
+        return table
+
+
+def code_scores(
+    models: Mapping[str, Any],
+    batch: AnyBatch,
+    samples: int = 50,
+    seed: int = 0,
+    untrained: Mapping[str, Any] | None = None,
+) -> CodeScores:
+    """Measure the diversity of the codes of models on the same observations.
+
+    Args:
+        models: models by name, as in `codes`.
+        batch: past of at least two test windows, as in `forecast`; 50 windows in the paper.
+        samples: K, number of codes.
+        seed: seed of the draws of every model.
+        untrained: the same models before training, by name.
+
+    Raises:
+        ValueError: there are fewer than two observations or samples.
+        TypeError: a model has no codes.
+    """
+    if len(batch[WHOLE]) < 2:
+        raise ValueError(f"the diversity of codes needs at least two observations, got {len(batch[WHOLE])}")
+
+    def measure(model: Any, same: bool = False) -> np.ndarray:
+        pasts = on_device_of(model, batch)
+        with seeded_evaluation(model, seed):
+            diversity = code_diversity(model, model.read(pasts) if same else pasts, samples)
+        return diversity.double().cpu().numpy()
+
+    rows = {}
+    for name, model in models.items():
+        rows[name] = {CODES: measure(model)}
+        if getattr(model, "shared", None):
+            rows[name][SAME] = measure(model, same=True)
+        if name in (untrained or {}):
+            rows[name][UNTRAINED] = measure((untrained or {})[name])
+    return CodeScores(rows, samples, seed)
 
 
 class CodeDiversity(Callback):

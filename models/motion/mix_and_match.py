@@ -25,9 +25,10 @@ Quaternions are normalised to unit length when poses are returned, and fed back 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -74,10 +75,12 @@ class MixAndMatchMotion(PoseMethod):
         noise: way to add the noise: "mix" (Mix-and-Match), "concatenate" (MT-VAE), "add" (HP-GAN) or "step"
             (Pose-Knows).
         alpha: share of the code that "mix" perturbs; 0 for a deterministic model.
-        width: L, units of recurrent networks and of the code; by default 1024 for Human3.6M's skeleton, as in the
+        width: L, units of recurrent networks and of the code; by default 1024 for Human3.6M's skeletons, as in the
             paper, and 128 for others.
         latent: size of z; by default floor((1 - alpha) L) with "mix", as in the paper, and L / 2 otherwise.
         scale: standard deviation of each coordinate of the quaternions, which sets the relative weight of the KL.
+        kl: lambda of the paper's loss, L_rot + L_skl + lambda KL, with means of squared errors and the KL of a window;
+            the paper has 1. Training then minimises this loss, in place of `scale`.
         skeleton: weight of the squared error of positions without the root's rotation, relative to the error of
             quaternions; both are means over coordinates.
         velocity: whether to predict the difference from the previous pose instead of the pose.
@@ -93,9 +96,13 @@ class MixAndMatchMotion(PoseMethod):
     generative = "p(z) p(x_t | x_{<t}, h, z, i)"
     inference = "q(z | x_{1:T}, h, i)"
     representation: ClassVar[str] = "quaternion"
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"human36m": {"width": 1024}, "": {"width": 128}}
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "human36m": {"width": 1024},
+        "human36m-angles": {"width": 1024},
+        "": {"width": 128},
+    }
     trainings: ClassVar[Mapping[str, Training]] = {
-        "human36m": Training(100_000, 64, 1e-3),
+        **dict.fromkeys(("human36m", "human36m-angles"), Training(100_000, 64, 1e-3)),
         "": Training(1000, 32, 2e-3, 0.5),
     }
 
@@ -104,6 +111,7 @@ class MixAndMatchMotion(PoseMethod):
     width: Size | None = None
     latent: Size | None = None
     scale: Positive = 0.01
+    kl: Positive | None = None
     skeleton: Amount = 1.0
     velocity: bool = False
     curriculum: Share = 0.5
@@ -118,6 +126,14 @@ class MixAndMatchMotion(PoseMethod):
                     f"{name} is {value}, but noise={self.noise!r} draws no indices; leave {name} at its default or use "
                     "noise='mix'"
                 )
+        if self.kl is not None and self.scale != 0.01:
+            raise ValueError(
+                f"scale is {self.scale} and kl is {self.kl}, but both set the weight of the KL; give only one of them"
+            )
+
+    def _with_scale(self, size: int) -> Self:
+        """Return the method with the scale at which D = `size` squared errors over 2 scale^2 are their mean."""
+        return self if self.kl is None else replace(self, kl=None, scale=math.sqrt(size / 2))
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
@@ -158,7 +174,8 @@ class MixAndMatchMotion(PoseMethod):
         schema = Schema.of(data)
         if not isinstance(schema, Poses):
             return self.with_presets(self.presets[""])._build_model(DynamicalVAE, schema.size(WHOLE), 2)
-        schema, method = Poses.of(schema, self.name, self.representation), self.resolve_defaults(schema)
+        schema = Poses.of(schema, self.name, self.representation)
+        method = self.resolve_defaults(schema)._with_scale(schema.size(WHOLE))
         return method._build_model(MixAndMatchModel, schema.size(WHOLE), schema.protocol.observed, method, schema)
 
     def _build_model(self, kind: Any, size: int, frames: int, *arguments: Any) -> Any:
@@ -175,9 +192,13 @@ class MixAndMatchMotion(PoseMethod):
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """Return one stage on squared errors of quaternions and positions and the KL, with scheduled sampling."""
         size = Schema.of(train).size(WHOLE)
+        scale, weight = self._with_scale(size).scale, 1.0
+        if self.kl is not None:  # of the KL per frame
+            schema = Poses.of(train, self.name, self.representation)
+            weight = self.kl * (schema.frames - schema.protocol.observed)
         objective = Evidence(
-            kl_weight=Logistic(0.0, 1.0, steps=max(int(self.annealing * steps), 1)) if self.annealing else 1.0,
-            energy_weights={"skeleton": self.skeleton * size / (2 * self.scale**2)} if self.skeleton else {},
+            kl_weight=Logistic(0.0, weight, steps=max(int(self.annealing * steps), 1)) if self.annealing else weight,
+            energy_weights={"skeleton": self.skeleton * size / (2 * scale**2)} if self.skeleton else {},
             select="loss",
         )
         gradual = self.noise == "mix" and self.curriculum

@@ -18,6 +18,7 @@ DEFAULT_PROTOCOLS = {
     "bandai21": "bandai2-by-style",
     "cmu21": "cmu8",
     "human36m": "h36m",
+    "human36m-angles": "h36m-angles",
     "humaneva": "humaneva",
     "walker": "simulated",
 }

@@ -1,7 +1,8 @@
 """Protocols: how motion is cut into windows, and which windows are for training, validation and test.
 
 Sources of the presets: DLow (Yuan and Kitani 2020) and GSPS (Mao, Liu and Salzmann 2021) for Human3.6M and HumanEva-I,
-TrajeVAE (Kania et al. 2021), and the READMEs of the data for bandai2 and cmu8.
+TrajeVAE (Kania et al. 2021), and the READMEs of the data for bandai2 and cmu8. `h36m-angles` is for Human3.6M's
+exponential maps at 25 fps: frames of Mix-and-Match (Aliakbarian et al. 2020), subjects of Martinez et al. 2017.
 
 Decisions where papers and code differ:
 
@@ -116,6 +117,14 @@ PROTOCOLS = {
     protocol.name: protocol
     for protocol in (
         Protocol("h36m", 25, 100, 50, train_stride=20, test_stride=25, **_HUMAN36M),
+        Protocol(
+            "h36m-angles",
+            *(16, 60, 25),
+            train_stride=10,
+            test_stride=25,
+            train=("S1", "S6", "S7", "S8", "S9", "S11"),
+            test=("S5",),
+        ),
         Protocol(
             "humaneva",
             *(15, 60, 60),
@@ -370,7 +379,7 @@ class Windows:
         if motion.skeleton.name == "human36m":
             self._named = {ACTION, GROUP} - {label for clip in motion for label in clip.labels}
         self._given: Tensor | float | None = None  # set by `given`
-        self._rows: Tensor | None = None  # set by `subset`
+        self._listed: tuple[Tensor, Tensor] | None = None  # set by `at`
         self._reason = ""
         self._starts = frames - length + 1
         if self.missing:
@@ -443,8 +452,8 @@ class Windows:
         Returns:
             {"x": (B, T, D)}, and "mask" if joints may be missing.
         """
-        if self._rows is not None:
-            raise ValueError(f"a subset of windows ({self._reason}) is for evaluation; draw from all windows")
+        if self._listed is not None:
+            raise ValueError("windows at chosen frames are for evaluation; draw from all windows")
         clip_draws, start_draws, angle_draws = torch.rand(3, batch_size, dtype=torch.float64, generator=generator)
         clips = torch.searchsorted(self._weights, clip_draws * self._weights[-1], right=True)
         starts = (start_draws * self._starts[clips]).long()
@@ -492,6 +501,29 @@ class Windows:
         if self._rotations is not None:
             batch["view_inputs"] = {ROTATIONS: self._cut_rotations(clips, starts)}
         return batch
+
+    def at(self, keys: Sequence[tuple[str, str, int]], reason: str = "") -> Windows:
+        """Return windows that start at given frames instead of at every stride, for evaluation.
+
+        Args:
+            keys: (split, clip, first frame) of each window, in any order; a window may be given twice.
+            reason: which windows these are, for titles of tables.
+
+        Raises:
+            ValueError: no window is given, a clip is unknown or too short, or a window begins or ends outside it.
+        """
+        indices = {clip.key: index for index, clip in enumerate(self.clips)}
+        for split, clip, start in keys:
+            if (split, clip) not in indices:
+                raise ValueError(f"no clip {split}/{clip} of at least {self.length} frames in {self}")
+            if not 0 <= start < (count := int(self._starts[indices[split, clip]])):
+                raise ValueError(f"a window of {split}/{clip} starts at frame {start}, expected 0 to {count - 1}")
+        if not keys:
+            raise ValueError("`keys` is empty; give at least one window")
+        windows = copy(self)
+        clips = torch.tensor([indices[split, clip] for split, clip, _ in keys])
+        windows._listed, windows._reason = (clips, torch.tensor([start for *_, start in keys])), reason
+        return windows
 
     def poses(self) -> Tensor:
         """Return every frame of the clips once, (N, D) float32, represented like the first frame of a window.
@@ -677,26 +709,6 @@ class Windows:
             description["title"] = [*description["title"], self._reason]
         return description
 
-    def subset(self, rows: Sequence[int], reason: str) -> Windows:
-        """Return some of the listed windows, for evaluation.
-
-        They cannot be drawn by `sample`, or listed with another stride.
-
-        Args:
-            rows: indices of the windows in `keys`, ascending.
-            reason: what the windows have in common, for titles.
-
-        Raises:
-            ValueError: there are no rows, or they are not ascending indices of windows.
-        """
-        indices = torch.as_tensor(rows, dtype=torch.long)
-        if not len(indices) or (indices.diff() <= 0).any() or indices[0] < 0 or indices[-1] >= len(self):
-            raise ValueError(f"rows must be ascending indices of the {len(self)} windows, got {brief(list(rows))}")
-        windows = copy(self)
-        windows._rows = indices if self._rows is None else self._rows[indices]
-        windows._reason = f"{len(indices)} of {len(self)} windows, {reason}"
-        return windows
-
     def with_protocol(self, protocol: Protocol) -> Windows:
         """Return these windows, cut by another protocol that splits clips and counts frames in the same way.
 
@@ -747,7 +759,7 @@ class Windows:
 
     def _keys(self, stride: int) -> Iterator[tuple[str, str, int]]:
         """Yield the keys of the listed windows one at a time, because there may be as many as frames."""
-        if self._rows is not None:
+        if self._listed is not None:
             clips, starts = (values.tolist() for values in self._list(stride))
             yield from ((*self.clips[clip].key, start) for clip, start in zip(clips, starts, strict=True))
             return
@@ -759,15 +771,17 @@ class Windows:
     def _list(self, stride: int) -> tuple[Tensor, Tensor]:
         """Return the clip index and first frame of every listed window."""
         stride = _at_least_one(stride)
-        if self._rows is not None and stride != self.stride:
-            raise ValueError(f"a subset of windows ({self._reason}) has the stride {self.stride}, got {stride}")
+        if self._listed is not None:
+            if stride != self.stride:
+                raise ValueError(f"windows at chosen frames have no other stride than {self.stride}, got {stride}")
+            return self._listed
         counts = (self._starts + stride - 1) // stride
         clips = torch.repeat_interleave(counts)
         starts = stride * (torch.arange(len(clips)) - (counts.cumsum(0) - counts)[clips])
         if self.missing:
             is_usable = self._has_usable_frames(self._first[clips] + starts)
             clips, starts = clips[is_usable], starts[is_usable]
-        return (clips, starts) if self._rows is None else (clips[self._rows], starts[self._rows])
+        return clips, starts
 
     def _has_usable_frames(self, first: Tensor) -> Tensor:
         """Return whether windows have usable frames in both parts; `first` counts frames over all clips."""

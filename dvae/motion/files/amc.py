@@ -1,4 +1,4 @@
-"""ASF/AMC, Acclaim's skeletons and motions, and the CMU benchmark's text files of exponential maps.
+"""ASF/AMC, Acclaim's skeletons and motions, and the text files of exponential maps of two benchmarks.
 
 A bone of an ASF file has a direction, a length and its own axes. The rows of an AMC file rotate it about these axes, by
 C M C^-1 relative to its parent. C is the matrix of its axes, and M the rotation in the row, with the first angle
@@ -11,7 +11,7 @@ If the file contains `length 0.45`, a unit is 1 / 0.45 inch (frequently asked qu
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.rotations import from_matrix, to_matrix
+from ..geometry.skeleton import HUMAN36M_ANGLES
 from .recording import END, Recording, check_joints, check_size, numbers, read_lines
 
 INCH = 0.0254
@@ -233,26 +234,40 @@ SUBJECT_02 = {
 
 
 def read_expmap(path: str | Path) -> Recording:
-    """Read exponential maps as in the CMU benchmark: rows of 117 numbers per frame, positions and rotation vectors.
+    """Read exponential maps: rows of 117 numbers (the CMU benchmark) or of 99 (Human3.6M), one for each frame.
 
-    The rotation vectors in the file are for row vectors, so their sign is reversed here. The first row is a rest pose,
-    not a frame, and is left out. The root rotation in the file composes the angles of the AMC file in the wrong order
-    (z x y instead of z y x). This tilts people who face away from +z. The angles are extracted and composed again in
-    the right order.
+    A row has a position and the rotation vectors of the root and of the joints, for row vectors, so their sign is
+    reversed here.
+
+    CMU: the first row is a rest pose, not a frame, and is left out. The root rotation in the file composes the angles
+    of the AMC file in the wrong order (z x y instead of z y x). This tilts people who face away from +z. The angles are
+    extracted and composed again in the right order.
+
+    Human3.6M: the files of Jain et al., 2016, arXiv 1511.05298 (h3.6m.zip), such as S5/walking_1.txt, at 50 Hz. The
+    first six numbers are the movement of the root since the last frame, in its own axes. They are added up from the
+    origin and from an upright pose. All subjects have the bones of `HUMAN36M_ANGLES`. The name of the file without its
+    number is the label "action".
 
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: the file has another format, or is damaged.
     """
     path = Path(path)
-    text = " ".join(read_lines(path)).replace(",", " ")
-    values = numbers(text, str(path))
+    lines = [line for line in read_lines(path) if line.strip()]
+    is_human36m = bool(lines) and len(lines[0].replace(",", " ").split()) == 3 + 3 * HUMAN36M_ANGLES.joints
+    values = numbers(" ".join(lines).replace(",", " "), str(path))
+    return _human36m(path, values) if is_human36m else _cmu(path, values)
+
+
+def _cmu(path: Path, values: np.ndarray) -> Recording:
+    """Return the recording in a file of the CMU benchmark."""
     bones = {name: Bone(parent, (x, y, z), torch.eye(3), "") for name, (parent, x, y, z) in SUBJECT_02.items()}
     names, parents, offsets = joints_of(bones)
     rows, remainder = divmod(len(values), 3 + 3 * len(names))
     if remainder or rows < 2:
         raise ValueError(
-            f"{path}: got {len(values):,} numbers, expected two or more rows of {3 + 3 * len(names)}, first a rest pose"
+            f"{path}: got {len(values):,} numbers, expected rows of {3 + 3 * HUMAN36M_ANGLES.joints} (Human3.6M), or "
+            f"two or more rows of {3 + 3 * len(names)}, first a rest pose (CMU)"
         )
     check_size(path, rows, len(names))
     vectors = torch.from_numpy(values).reshape(rows, -1, 3)[1:]
@@ -265,6 +280,30 @@ def read_expmap(path: str | Path) -> Recording:
     places = torch.from_numpy(offsets).repeat(rows - 1, 1, 1)
     places[:, 0] = vectors[:, 0]
     return Recording.turned(names, parents, places, rotations, fps=FPS, metres=INCH / 0.45, up="y")
+
+
+def _human36m(path: Path, values: np.ndarray) -> Recording:
+    """Return the recording in a file of Human3.6M's exponential maps."""
+    skeleton = HUMAN36M_ANGLES
+    rows, remainder = divmod(len(values), 3 + 3 * skeleton.joints)
+    if remainder:
+        raise ValueError(
+            f"{path}: got {len(values):,} numbers, expected rows of {3 + 3 * skeleton.joints} as in its first line"
+        )
+    check_size(path, rows, skeleton.joints)
+    vectors = torch.from_numpy(values).reshape(rows, -1, 3)
+    rotations = to_matrix(-vectors[:, 1:], "vector")
+    places = (1000 * skeleton.offsets.to(vectors)).repeat(rows, 1, 1)
+    turn, place = torch.eye(3).to(vectors), torch.zeros(3).to(vectors)
+    for row, movement in enumerate(vectors[:, 0]):
+        place = place + turn @ movement
+        turn = turn @ rotations[row, 0]
+        places[row, 0], rotations[row, 0] = place, turn
+    action = path.stem.rpartition("_")[0]
+    recording = Recording.turned(
+        skeleton.names, skeleton.parents, places, rotations, fps=skeleton.fps, metres=0.001, up=skeleton.up
+    )
+    return replace(recording, skeleton=skeleton, labels={"action": action} if action else {})
 
 
 def _rotation(angles: Tensor, axes: str) -> Tensor:

@@ -564,6 +564,37 @@ HUMAN36M_KEPT = (0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 17, 18, 19, 25, 26, 27)
 """Indices of the joints of `HUMAN36M` among the 32 joints of that archive; `read_motion` selects these joints."""
 
 # fmt: off
+HUMAN36M_ANGLES = Skeleton(
+    names=(
+        "Pelvis", "RHip", "RKnee", "RFoot", "RToe", "RToeEnd", "LHip", "LKnee", "LFoot", "LToe", "LToeEnd",
+        "Waist", "Spine", "Thorax", "Neck", "Head",
+        "LClavicle", "LShoulder", "LElbow", "LWrist", "LThumb", "LThumbEnd", "LHand", "LHandEnd",
+        "RClavicle", "RShoulder", "RElbow", "RWrist", "RThumb", "RThumbEnd", "RHand", "RHandEnd",
+    ),
+    parents=(
+        -1, 0, 1, 2, 3, 4, 0, 6, 7, 8, 9, 0, 11, 12, 13, 14, 12, 16, 17, 18, 19, 20, 19, 22, 12, 24, 25, 26, 27, 28,
+        27, 30,
+    ),
+    left=(6, 7, 8, 9, 10, 16, 17, 18, 19, 20, 21, 22, 23),
+    right=(1, 2, 3, 4, 5, 24, 25, 26, 27, 28, 29, 30, 31),
+    up="y",
+    fps=50.0,
+    name="human36m-angles",
+    rest=(
+        0, 0, 0, -0.132948591, 0, 0, 0, -0.442894612, 0, 0, -0.454206447, 0, 0, 0, 0.162767078, 0, 0, 0.074999437,
+        0.132948826, 0, 0, 0, -0.442894413, 0, 0, -0.45420659, 0, 0, 0, 0.162767426, 0, 0, 0.074999948,
+        0, 0.0001, 0, 0, 0.233383263, 0, 0, 0.257077681, 0, 0, 0.121134938, 0, 0, 0.115002227, 0,
+        0, 0.257077681, 0, 0, 0.151034226, 0, 0, 0.278882773, 0, 0, 0.251733451, 0, 0, 0, 0, 0, 0, 0.099999627,
+        0, 0.100000188, 0, 0, 0, 0,
+        0, 0.257077681, 0, 0, 0.151031437, 0, 0, 0.278892924, 0, 0, 0.25172868, 0, 0, 0, 0, 0, 0, 0.099999888,
+        0, 0.137499922, 0, 0, 0, 0,
+    ),
+)
+# fmt: on
+"""The 32 joints of Human3.6M's exponential maps, with the bones that Martinez, Black and Romero, 2017, arXiv
+1705.02445, use for all subjects: y up, 50 Hz. Bones of length 0 end at the same place as they start."""
+
+# fmt: off
 HUMANEVA = Skeleton(
     names=(
         "Pelvis", "Thorax", "LShoulder", "LElbow", "LWrist", "RShoulder", "RElbow", "RWrist", "LHip", "LKnee",

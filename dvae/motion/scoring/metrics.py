@@ -106,13 +106,14 @@ def several_futures(windows: Windows) -> Windows:
         ValueError: no window has several futures.
     """
     threshold = windows.protocol.multimodal_threshold
-    rows = [row for row, truths in enumerate(multimodal_truths(windows, threshold)) if len(truths) > 1]
-    if not rows:
+    truths = multimodal_truths(windows, threshold)
+    keys = [key for key, futures in zip(windows.keys, truths, strict=True) if len(futures) > 1]
+    if not keys:
         raise ValueError(
             f"none of the {len(windows)} windows has several futures: no two last observed poses are closer than "
             f"{threshold:g} m; raise the protocol's multimodal_threshold"
         )
-    return windows.subset(rows, "those with several futures")
+    return windows.at(keys, f"{len(keys)} of {len(windows)} windows, those with several futures")
 
 
 def multimodal_note(threshold: float, itself: bool, alone: int, windows: int) -> str:

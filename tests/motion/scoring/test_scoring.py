@@ -208,12 +208,10 @@ def test_only_windows_with_several_futures_are_scored_on_request():
     assert evaluation.basis["multimodal"]["alone"] == 0
     assert scores(windows, futures)["ADE"] != pytest.approx(evaluation["model"]["ADE"].mean, rel=1e-3)
 
-    with pytest.raises(ValueError, match=r"those with several futures\) is for evaluation"):
+    with pytest.raises(ValueError, match="are for evaluation"):
         kept.sample(2, torch.Generator())
-    with pytest.raises(ValueError, match="has the stride 20, got 3"):
+    with pytest.raises(ValueError, match="no other stride than 20, got 3"):
         kept.all(3)
-    with pytest.raises(ValueError, match="ascending indices of the 5 windows"):
-        windows.subset([1, 0], "")
     apart = motion.windows(motion.MotionSet([clips[n] for n in (0, 1, 3)], motion.WALKER), PROTOCOL, "test")
     with pytest.raises(ValueError, match="none of the 3 windows has several futures"):
         motion.several_futures(apart)
