@@ -10,7 +10,7 @@ from pyro import poutine
 import dvae
 from dvae import motion
 from dvae.distributions import Subset
-from dvae.models.motion.codes import CodeDiversity, codes
+from dvae.models.motion.codes import CodeDiversity, CodeScores, code_scores, codes
 from dvae.models.motion.mix_and_match import _unrotated_positions
 from dvae.motion.geometry.views import ROTATIONS
 from dvae.networks.noise import MixAndMatch
@@ -144,6 +144,31 @@ def test_the_loss_adds_errors_of_quaternions_and_positions_and_the_annealed_kl(w
         torch.testing.assert_close(objective(terms, step), expected, rtol=1e-5, atol=0.02 * float(kl))
 
 
+def test_the_loss_of_the_paper_has_means_of_squared_errors_and_the_kl_of_a_window(windows):
+    """L_rot + L_skl + lambda KL; the constant of the likelihood does not depend on the parameters."""
+    method = small(kl=0.7)
+    torch.manual_seed(0)
+    model = method.build(windows["train"]).eval()
+    batch = windows["train"].sample(5, torch.Generator().manual_seed(0))
+    objective = method.train(windows["train"], steps=40).objective
+    torch.manual_seed(0)
+    terms = dvae.SequenceELBO().terms(model, batch)
+    torch.manual_seed(0)
+    guide = poutine.trace(model.guide).get_trace(batch)
+    trace = poutine.trace(poutine.replay(model.model, guide)).get_trace(batch)
+    data = model.read(batch)
+    means = trace.nodes["x"]["fn"].rollout.parameters("x", data["x"])[0]
+    places = [_unrotated_positions(x, data["bone_lengths"], model.rotations) for x in (means, data["x"])]
+    errors = (means - data["x"]).square().mean() + (places[0] - places[1]).square().mean()
+    size = model.sizes["x"]
+    constant = 0.5 * size * np.log(np.pi * size)
+    for step, weight in ((0, 0.0), (10, 0.35), (39, 0.7)):
+        expected = errors + weight * terms.kl["z"].mean()
+        torch.testing.assert_close(objective(terms, step) - constant, expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="both set the weight of the KL"):
+        small(kl=1.0, scale=0.1)
+
+
 @pytest.mark.parametrize("noise", ["mix", "add"])
 def test_each_use_of_noise_is_trained_and_scored_in_metres(windows, noise):
     method = small(noise=noise)
@@ -179,6 +204,19 @@ def test_the_codes_are_those_of_the_forecasts(windows, noise):
         state = code if noise == "step" else network.cell(last[:, None], code[None].contiguous())[0][:, 0]
         decoded = model.to_data_space({"x": network.out(state)[:, None]}, data)["x"]
         torch.testing.assert_close(decoded, x, atol=1e-6, rtol=1e-5)
+
+
+def test_the_diversity_of_codes_is_a_result_that_can_be_saved(windows, tmp_path):
+    models = {noise: build_model(windows, noise=noise) for noise in ("mix", "concatenate")}
+    scores = code_scores(models, past(windows), samples=5, untrained={"mix": models["mix"]})
+    assert scores.rows["mix"].keys() == {"codes", "same indices", "untrained"}
+    assert scores.rows["concatenate"].keys() == {"codes"}  # it draws no indices
+    np.testing.assert_array_equal(scores.rows["mix"]["untrained"], scores.rows["mix"]["codes"])
+    assert scores.rows["mix"]["same indices"].mean() < scores.rows["mix"]["codes"].mean()
+    scores.save(tmp_path / "codes.json")
+    assert str(CodeScores.load(tmp_path / "codes.json")) == str(scores)
+    with pytest.raises(ValueError, match="at least two observations"):
+        code_scores(models, past(windows, 1))
 
 
 def test_the_diversity_of_codes_is_logged_and_does_not_change_training(windows, tmp_path):

@@ -411,9 +411,27 @@ class TestWindows:
         with pytest.raises(ValueError, match="stride is -1"):
             windows(motion(), TINY, "test").all(-1)
 
+    def test_windows_may_start_at_chosen_frames(self):
+        all_windows = windows(motion(), TINY, "train")
+        keys = [("train", "clip_4", 7), ("train", "clip_0", 2), ("train", "clip_4", 7)]
+        chosen = all_windows.at(keys)
+        assert chosen.keys == keys
+        assert len(chosen) == 3
+        every = dict(zip(all_windows.index(1), all_windows.all(1)["x"], strict=True))
+        torch.testing.assert_close(chosen.all()["x"], torch.stack([every[key] for key in keys]), rtol=0, atol=0)
+        assert chosen.fingerprint != all_windows.fingerprint
+        for wrong, message in (
+            ([], "is empty"),
+            ([("train", "clip_9", 0)], "no clip train/clip_9"),
+            ([("train", "clip_0", 14)], "starts at frame 14, expected 0 to 13"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                all_windows.at(wrong)
+
     def test_preset_protocols_match_the_papers(self):
         values = {name: (p.observed, p.predicted, p.fps) for name, p in PROTOCOLS.items()}
         assert values["h36m"] == (25, 100, 50)
+        assert values["h36m-angles"] == (16, 60, 25)
         assert values["humaneva"] == (15, 60, 60)
         assert values["trajevae"] == (1, 100, 50)
         assert values["bandai2-by-style"] == values["cmu8"] == values["simulated"] == (15, 60, 30)

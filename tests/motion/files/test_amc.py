@@ -1,9 +1,13 @@
 """ASF/AMC files and exponential maps: the same motion as in the archive of positions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from dvae.motion import read_motion
 from dvae.motion.files.amc import read_amc, read_expmap
+from dvae.motion.geometry.skeleton import HUMAN36M_ANGLES
 
 LEGS = [f"{side}{bone}" for side in "lr" for bone in ("femur", "tibia", "foot", "toes")]
 ARMS = [f"{side}{bone}" for side in "lr" for bone in ("humerus", "radius", "hand")]
@@ -110,8 +114,59 @@ def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):
     assert len(read_amc(tmp_path / "02_01.amc").positions) == 2
 
 
+def human36m_rows(frames=6, seed=0):
+    """Return rows of 99 numbers, in which joints without children are not rotated, as in Human3.6M."""
+    random = np.random.default_rng(seed)
+    rows = random.normal(size=(frames, 33, 3)) * np.array([30, 0.1, *[0.4] * 31])[:, None]
+    rows[:, [1 + joint for joint in range(32) if joint not in HUMAN36M_ANGLES.parents]] = 0
+    return rows.reshape(frames, 99)
+
+
+def row_matrix(vector):
+    """Return the rotation matrix of a vector by Rodrigues' formula."""
+    angle = np.linalg.norm(vector)
+    x, y, z = vector / (angle or 1)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def test_human36m_is_placed_as_by_the_public_code(tmp_path):
+    """Matrices of the public code act on rows; a root's movement is in its own axes of the frame before."""
+    (tmp_path / "S5").mkdir()
+    rows = human36m_rows()
+    np.savetxt(tmp_path / "S5" / "walking_1.txt", rows, delimiter=",")
+    turn, place = np.eye(3), np.zeros(3)
+    positions = []
+    for row in rows.reshape(len(rows), 33, 3):
+        place = place + turn.T @ row[0]
+        turn = row_matrix(row[1]) @ turn
+        joints, turns = [place / 1000], [turn]
+        for joint, parent in list(enumerate(HUMAN36M_ANGLES.parents))[1:]:
+            joints.append(HUMAN36M_ANGLES.offsets[joint].numpy() @ turns[parent] + joints[parent])
+            turns.append(row_matrix(row[1 + joint]) @ turns[parent])
+        positions.append(joints)
+    recording = read_expmap(tmp_path / "S5" / "walking_1.txt")
+    assert (recording.fps, recording.up, recording.labels) == (50, "y", {"action": "walking"})
+    np.testing.assert_allclose(recording.metres * recording.positions, positions, atol=1e-9)
+    people = read_motion(tmp_path)
+    assert replace(people.skeleton, rest=HUMAN36M_ANGLES.rest) == HUMAN36M_ANGLES
+    np.testing.assert_allclose(people.skeleton.rest, HUMAN36M_ANGLES.rest, atol=1e-12)
+    assert people.clips[0].key == ("S5", "walking_1")
+    assert people.clips[0].labels["action"] == "walking"
+    halved = people.resample(25)
+    np.testing.assert_array_equal(halved.clips[0].rotations, people.clips[0].rotations[::2])
+
+
+def test_a_human36m_file_with_a_short_row_is_an_error(tmp_path):
+    np.savetxt(tmp_path / "a.txt", human36m_rows(), delimiter=",")
+    with (tmp_path / "a.txt").open("a") as file:
+        file.write("1,2,3\n")
+    with pytest.raises(ValueError, match="got 597 numbers, expected rows of 99"):
+        read_expmap(tmp_path / "a.txt")
+
+
 @pytest.mark.parametrize("text", ["", "0 " * 117, "0 " * 233 + "nan"])
 def test_invalid_exponential_maps_are_errors(text, tmp_path):
     (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(ValueError, match=r"expected two or more rows of 117|not a number"):
+    with pytest.raises(ValueError, match=r"two or more rows of 117|not a number"):
         read_expmap(tmp_path / "a.txt")
