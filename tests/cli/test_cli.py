@@ -37,6 +37,44 @@ def failure(capsys, *arguments, code=1):
     return error
 
 
+def write_human36m(folder, frames=340):
+    """Write exponential maps in the layout of h3.6m.zip."""
+    random, time = np.random.default_rng(0), np.arange(frames)[:, None] / 50
+    for name in ("S1/walking", "S5/eating", "S5/walking"):
+        for number in (1, 2):
+            file = folder / f"{name}_{number}.txt"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            rows = np.zeros((frames, 99))
+            rows[1:, 2] = 20.0  # mm per frame
+            rows[:, 6:15] = 0.3 * np.sin(2 * np.pi * (time * random.random(9) + random.random(9)))
+            np.savetxt(file, rows, fmt="%.7f", delimiter=",")
+
+
+def test_the_route_of_mix_and_match_from_human36m_to_its_measures(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_human36m(tmp_path / "dataset")
+    assert main("data convert dataset --out h36m.npz --fps 25".split()) == 0
+    options = "--kl 1 --width 4 --steps 2 --batch-size 4 --out run"
+    assert main(f"fit mix-and-match --data h36m.npz --representation quaternion {options}".split()) == 0
+    assert dvae.load("run").schema.protocol.name == "h36m-angles"
+    capsys.readouterr()
+    assert main("evaluate run --measure angles --actions --samples 2".split()) == 0
+    output = capsys.readouterr().out
+    assert "1000 ms, best of 2" in output
+    assert all(f"│ {row} " in output for row in ("eating", "walking", "mean"))
+    quick = "--quality-width 4 --quality-examples 6 --quality-steps 2 --quality-seeds 1"
+    for measure, column in ((f"quality {quick}", "taken for real"), ("codes --samples 3", "untrained")):
+        assert main(f"evaluate run --measure {measure}".split()) == 0
+        assert column in " ".join(capsys.readouterr().out.split())
+    assert {path.name for path in Path("run").glob("*.json")} >= {"angles-by-action.json", "quality.json", "codes.json"}
+    for arguments, message in (
+        ("quality --actions", "options of --measure angles do not apply to --measure quality"),
+        ("codes --figure a.png", "has no figure"),
+        ("codes --bound-particles 2", "do not apply to --measure codes"),
+    ):
+        assert message in " ".join(failure(capsys, *f"evaluate run --measure {arguments}".split(), code=2).split())
+
+
 def test_every_method_is_listed_with_its_equations(capsys):
     assert main(["list"]) == 0
     output = capsys.readouterr().out
