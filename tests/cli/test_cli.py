@@ -53,12 +53,12 @@ def write_human36m(folder, frames=340):
 def test_the_route_of_mix_and_match_from_human36m_to_its_measures(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_human36m(tmp_path / "dataset")
-    assert main("data convert dataset --out h36m.npz --fps 25".split()) == 0
+    assert main(["data", "convert", "dataset", "--out", "h36m.npz", "--fps", "25"]) == 0
     options = "--kl 1 --width 4 --steps 2 --batch-size 4 --out run"
     assert main(f"fit mix-and-match --data h36m.npz --representation quaternion {options}".split()) == 0
     assert dvae.load("run").schema.protocol.name == "h36m-angles"
     capsys.readouterr()
-    assert main("evaluate run --measure angles --actions --samples 2".split()) == 0
+    assert main(["evaluate", "run", "--measure", "angles", "--actions", "--samples", "2"]) == 0
     output = capsys.readouterr().out
     assert "1000 ms, best of 2" in output
     assert all(f"│ {row} " in output for row in ("eating", "walking", "mean"))
