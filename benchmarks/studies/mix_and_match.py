@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import itemgetter
@@ -70,6 +70,8 @@ class Section:
         options: options of all cases, in place of `OPTIONS`.
         training: options of training, in place of `TRAINING`.
         steps: training steps of a run, in place of the fraction.
+        longer: numbers of steps of longer runs, fitted one after the other while no case reaches `until`.
+        until: quality in per cent, mean over seeds, that ends the section.
     """
 
     protocol: str
@@ -78,6 +80,8 @@ class Section:
     options: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 0
+    longer: Sequence[int] = ()
+    until: float = 50.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "steps", self.steps or round(self.share * STEPS))
@@ -236,10 +240,10 @@ def angles(rows: Mapping[str, Row]) -> Table:
     return Table(["", "best of", *(f"{time:g} ms" for time in TIMES)], lines)
 
 
-def tables(name: str, rows: Mapping[str, Row]) -> dict[str, Table]:
-    """Return a section's tables."""
+def tables(name: str, rows: Mapping[str, Row], steps: int) -> dict[str, Table]:
+    """Return the tables of a section, whose runs have so many steps."""
     first = next(iter(rows.values())).runs[0]
-    clips, costs = first["futures"]["weights"], budget(rows.values(), SECTIONS[name].steps)
+    clips, costs = first["futures"]["weights"], budget(rows.values(), steps)
     note = f"{sum(clips)} windows of {len(clips)} clips; {first['jerk']}. {costs}"
     futures = {case: row.of("futures") for case, row in rows.items()}
     named_tables = {
@@ -313,25 +317,30 @@ def main(
         sections: sections to fit.
         cases: names of cases to fit; all cases of a section if empty.
         seeds: seeds of the runs to fit.
-        steps: other number of training steps of the sections to fit, whose runs and tables then have names with it.
+        steps: other number of training steps of the sections to fit, which the names of runs and tables then contain.
     """
     torch.set_num_threads(1)
-    if steps:
-        changed = {f"{name}, {steps} steps": replace(SECTIONS[name], steps=steps) for name in sections}
-        SECTIONS.update(changed)
-        sections = tuple(changed)
-    for name, section in ((name, SECTIONS[name]) for name in sections):
-        if file := raw if section.protocol == RAW else data:
-            run = partial(measured, section, data_of(section.protocol, file))
-            measure(runs / folder(name), cases or section.cases, seeds, run)
-    stored = {name: read(runs / folder(name), section.cases) for name, section in SECTIONS.items()}
+    all_sections = dict(SECTIONS)
+    for name in sections:
+        section = SECTIONS[name]
+        file = raw if section.protocol == RAW else data
+        lengths = (steps,) if steps else (section.steps, *section.longer)
+        for length in lengths if file else ():
+            title = name if length == section.steps else f"{name}, {length} steps"
+            all_sections[title] = replace(section, steps=length)
+            run = partial(measured, all_sections[title], data_of(section.protocol, file))
+            measure(runs / folder(title), cases or section.cases, seeds, run)
+            rows = read(runs / folder(title), section.cases).values()
+            if max(row.of("futures").by_seed("quality").mean() for row in rows) >= section.until:
+                break
+    stored = {name: read(runs / folder(name), section.cases) for name, section in all_sections.items()}
     rows_by_section = {
         name: ({STILL: replace(rows["mix"], name=STILL)} if "mix" in rows else {}) | rows
         for name, rows in stored.items()
     }
     for name, rows in rows_by_section.items():
         if rows:
-            write(results, tables(name, rows))
+            write(results, tables(name, rows, all_sections[name].steps))
     if rows_by_section[TUNING]:
         draw(rows_by_section[TUNING], rows_by_section["alpha"], picture)
 

@@ -79,7 +79,7 @@ def read_motion(
     |---|---|
     | `.bvh` | |
     | `.amc` | with its `.asf` in the same folder |
-    | `.txt` | exponential maps as in the CMU benchmark |
+    | `.txt` | exponential maps as in the CMU benchmark, or of Human3.6M |
     | `.c3d` | markers |
     | `.csv` | one clip in metres, columns such as LWrist_x, LWrist_y, LWrist_z; needs a skeleton |
     | `.npz` | AMASS: one clip, members `poses`, `trans`, `mocap_framerate` |
