@@ -134,7 +134,7 @@ def measured(section: Section, data: motion.MotionData, case: str, seed: int, ou
     some = torch.linspace(0, len(test) - 1, min(WATCHED, len(test))).long()
     past = test.all().past(test.protocol.observed).rows(some)
     watch = CodeDiversity(past, every=max(steps // 15, 1))
-    every = min(max(steps // 3, 1), CHECKPOINTS)  # checkpoints, from which an interrupted run continues
+    every = min(max(steps // 3, 1), CHECKPOINTS)  # an interrupted run continues from the last checkpoint
     training = {**TRAINING, **section.training, "steps": steps, "validate_every": every, "callbacks": [watch]}
     fit = fit_or_load(method, data, train, out=out, seed=seed, **training)
     model, (watched, diversity) = fit.model.eval(), fit.series("codes/diversity")

@@ -16,6 +16,7 @@ from ..inference.evaluation.compare import compare as compare_models
 from ..inference.evaluation.evaluate import evaluate as evaluate_models
 from ..inference.evaluation.scores import Scores
 from ..inference.training.checkpoints import CheckpointError, Run
+from ..locking import seeded
 from ..models.motion.codes import code_scores
 from ..models.motion.trajectories import TrajectoryModel
 from ..motion.geometry.euler import euler_errors
@@ -274,8 +275,8 @@ def _measure(
         rows = torch.linspace(0, len(windows) - 1, min(OBSERVATIONS, len(windows))).long()
         untrained = {}
         for name, run in zip(models, loaded, strict=True):
-            torch.manual_seed(run.config.training.seed)
-            untrained[name] = run.method.build(run.schema)
+            with seeded(run.config.training.seed):
+                untrained[name] = run.method.build(run.schema)
         past = windows.all().past(windows.protocol.observed).rows(rows)
         result = code_scores(models, past, scoring.samples, seed, untrained)
     record = f"{loading.record(measure, loaded[0], data_set)}{'-by-action' * angles.actions}.json"

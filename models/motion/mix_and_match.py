@@ -133,7 +133,7 @@ class MixAndMatchMotion(PoseMethod):
             )
 
     def _with_scale(self, size: int) -> Self:
-        """Return the method with the scale at which D = `size` squared errors over 2 scale^2 are their mean."""
+        """Return the method with scale = sqrt(D / 2) if `kl` is set: the log-likelihood then has the mean error."""
         return self if self.kl is None else replace(self, kl=None, scale=math.sqrt(size / 2))
 
     @override

@@ -224,6 +224,7 @@ def test_mix_and_match(tmp_path, out, monkeypatch):
         name: mix_and_match.Section(mix_and_match.RAW, c)
         for name, c in {mix_and_match.RAW: named, "alpha": alphas}.items()
     }
+    sections["alpha"] = replace(sections["alpha"], longer=(3,), until=101.0)  # a quality that no case reaches
     monkeypatch.setattr(mix_and_match, "SECTIONS", sections)
     motion.write_motion(tmp_path / "bvh", motion.simulate(clips=2, frames=240, seed=1), "bvh")
     options = {
@@ -246,6 +247,7 @@ def test_mix_and_match(tmp_path, out, monkeypatch):
     counts = [["mix, velocity", "1"], ["mix, velocity", "5"], ["no noise", "1"]]
     assert [row[:2] for row in angles[1:]] == [["zero velocity", "1"], ["mix", "1"], *counts]
     assert [row[0] for row in swept[1:]] == ["alpha 0.1", "alpha 0.3"]
+    assert "3 steps of training" in (out / "mix_and_match" / "alpha-3-steps-futures.txt").read_text()
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 

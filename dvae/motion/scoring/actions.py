@@ -60,11 +60,11 @@ def action_windows(windows: Windows) -> Windows:
 
 
 def errors_by_action(evaluation: Evaluation, windows: Windows, model: str, count: int) -> Table:
-    """Return a table of a model's errors (`euler_errors`) with one row per action, and their mean.
+    """Return a table of a model's errors: one row per action, and the mean over actions.
 
     Args:
-        evaluation: errors on `windows`.
-        windows: result of `action_windows`.
+        evaluation: errors from `euler_errors` on `windows`.
+        windows: windows of all actions, as from `action_windows`.
         model: name of the model.
         count: number K of futures from which the best is chosen.
     """

@@ -115,7 +115,7 @@ def test_the_skeleton_has_the_name_of_the_recording_or_its_subject(tmp_path):
 
 
 def human36m_rows(frames=6, seed=0):
-    """Return rows of 99 numbers, in which joints without children are not rotated, as in Human3.6M."""
+    """Return rows of 99 numbers. As in Human3.6M, joints without children are not rotated."""
     random = np.random.default_rng(seed)
     rows = random.normal(size=(frames, 33, 3)) * np.array([30, 0.1, *[0.4] * 31])[:, None]
     rows[:, [1 + joint for joint in range(32) if joint not in HUMAN36M_ANGLES.parents]] = 0
