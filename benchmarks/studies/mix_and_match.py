@@ -301,7 +301,7 @@ def main(
     runs: Path = Path("runs/mix-and-match"),
     results: Path | None = None,
     picture: Path = DOCS / "img" / "mix_and_match.png",
-    sections: tuple[str, ...] = tuple(SECTIONS),
+    sections: tuple[str, ...] = tuple(name for name, section in SECTIONS.items() if not section.longer),
     cases: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0, 1, 2),
     steps: int | None = None,
@@ -314,25 +314,25 @@ def main(
         runs: folder of the runs.
         results: folder of the tables, such as benchmarks/results; None prints them.
         picture: figure of codes over training, and of quality against diversity.
-        sections: sections to fit.
+        sections: sections to fit; by default all without longer runs, which need a GPU.
         cases: names of cases to fit; all cases of a section if empty.
         seeds: seeds of the runs to fit.
         steps: other number of training steps of the sections to fit, which the names of runs and tables then contain.
     """
     torch.set_num_threads(1)
-    all_sections = dict(SECTIONS)
-    for name in sections:
-        section = SECTIONS[name]
+    all_sections: dict[str, Section] = {}
+    for name, section in SECTIONS.items():
         file = raw if section.protocol == RAW else data
-        lengths = (steps,) if steps else (section.steps, *section.longer)
-        for length in lengths if file else ():
+        is_chosen = name in sections
+        for length in dict.fromkeys([steps or section.steps, section.steps, *section.longer]):
             title = name if length == section.steps else f"{name}, {length} steps"
             all_sections[title] = replace(section, steps=length)
-            run = partial(measured, all_sections[title], data_of(section.protocol, file))
-            measure(runs / folder(title), cases or section.cases, seeds, run)
-            rows = read(runs / folder(title), section.cases).values()
-            if max(row.of("futures").by_seed("quality").mean() for row in rows) >= section.until:
-                break
+            if is_chosen and file is not None:
+                run = partial(measured, all_sections[title], data_of(section.protocol, file))
+                measure(runs / folder(title), cases or section.cases, seeds, run)
+                rows = read(runs / folder(title), section.cases).values()
+                best = max(row.of("futures").by_seed("quality").mean() for row in rows)
+                is_chosen = not steps and best < section.until
     stored = {name: read(runs / folder(name), section.cases) for name, section in all_sections.items()}
     rows_by_section = {
         name: ({STILL: replace(rows["mix"], name=STILL)} if "mix" in rows else {}) | rows

@@ -15,8 +15,8 @@ representation:
 
 Aliakbarian, Saleh, Salzmann, Petersson and Gould, 2020, arXiv 1908.00733, which cites the sources of the other ways.
 There is no public code for motion. The paper's loss has means of squared errors and a KL of weight 1 (`kl`). Our
-default is the ELBO at `scale` .01, where the KL weighs 2 scale^2 / (T D), 5e-8 for 60 frames of 16 quaternions. Our choices
-where the paper gives no detail:
+default is the ELBO at `scale` .01, where the KL weighs 2 scale^2 / (T D), 5e-8 for 60 frames of 16 quaternions. Our
+choices where the paper gives no detail:
 
 * The layers of the blocks and of the decoder of the code, whose output has the range of a state.
 * The lengths of the schedules.
