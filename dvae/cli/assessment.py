@@ -106,8 +106,8 @@ class Quality:
 def evaluate(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     control: Control,
-    angles: Angles,
-    realism: Quality,
+    angles: Angles = Angles(),
+    realism: Quality = Quality(),
     data: str | None = None,
     measure: Literal["forecasts", "quality", "angles", "codes"] = "forecasts",
     missing: Expert[Missing] = False,
@@ -255,12 +255,17 @@ def _measure(
             raise UsageError(
                 "--measure quality needs the training windows of the runs; leave out --data with other data"
             )
-        options = {"steps": realism.quality_steps, "examples": realism.quality_examples, "seed": seed}
-        at_least(1, **{f"quality_{name}": options[name] for name in ("steps", "examples")})
-        at_least(1, quality_width=realism.quality_width, quality_seeds=realism.quality_seeds)
-        classifier = RealOrGenerated(realism.quality_width)
-        seeds = range(realism.quality_seeds)
-        result = quality(models, data_set.windows("train"), windows, method=classifier, seeds=seeds, **options)
+        at_least(1, **vars(realism))
+        result = quality(
+            models,
+            data_set.windows("train"),
+            windows,
+            method=RealOrGenerated(realism.quality_width),
+            examples=realism.quality_examples,
+            steps=realism.quality_steps,
+            seeds=range(realism.quality_seeds),
+            seed=seed,
+        )
     elif measure == "angles":
         windows = action_windows(windows) if angles.actions else windows
         counts = sorted({1, scoring.samples})

@@ -123,7 +123,7 @@ class CodeScores(Result):
 
 def code_scores(
     models: Mapping[str, Any],
-    batch: AnyBatch,
+    batch: Mapping[str, Any],
     samples: int = 50,
     seed: int = 0,
     untrained: Mapping[str, Any] | None = None,
@@ -150,7 +150,7 @@ def code_scores(
             diversity = code_diversity(model, model.read(pasts) if same else pasts, samples)
         return diversity.double().cpu().numpy()
 
-    rows = {}
+    rows: dict[str, dict[str, np.ndarray]] = {}
     for name, model in models.items():
         rows[name] = {CODES: measure(model)}
         if getattr(model, "shared", None):
