@@ -23,7 +23,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, astuple, dataclass, field, replace
 from math import pi
-from reprlib import repr as brief
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
