@@ -22,7 +22,7 @@ from ..models.motion.trajectories import TrajectoryModel
 from ..motion.geometry.euler import euler_errors
 from ..motion.metric_models.pose_prior import PosePriorModel
 from ..motion.metric_models.quality import RealOrGenerated, quality
-from ..motion.scoring.actions import action_windows, errors_by_action
+from ..motion.scoring.by_action import action_windows, errors_by_action
 from ..runs import directory as runs
 from . import loading
 from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, note, save_figure

@@ -9,7 +9,7 @@ import torch
 import dvae
 from dvae import motion
 from dvae.motion.geometry.euler import euler_errors
-from dvae.motion.scoring.actions import action_windows, errors_by_action
+from dvae.motion.scoring.by_action import action_windows, errors_by_action
 
 ACTIONS, TIMES = ("eating", "walking"), (80, 1000)
 
