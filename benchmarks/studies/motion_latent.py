@@ -27,7 +27,7 @@ from dvae.motion.segments.reconstruction import reconstruct_segments
 from .engine import OURS, Row, budget, fit_or_load, folder, interval, measure, read, settings
 from .results import Table, tabled, write
 
-TUNING, HELD_OUT = "tuning", "held out"
+TUNING, HELD_OUT, PRIOR = "tuning", "held out", "prior"
 SAME, OTHER = "same source", "other source"
 GROUPS = {"A": "train", "B": "test"}
 """Splits of the file groups of bandai2 for tuning, which replace the split of the file."""
@@ -38,14 +38,14 @@ FALLS = ("falls", "falls where the run is shorter")
 ERROR, DURATION = "vertex error", "duration error"
 FULL, FIRST, SHAPED = "both phases", "first phase alone", "guide with beta"
 CASES = settings(__file__)
-SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD_OUT: CASES["named"]}
+SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD_OUT: CASES["named"], PRIOR: CASES["prior"]}
 
 
 @cache
 def segments(section: str, file: Path, **options: Any) -> SegmentData:
     """Read gait cycles of bandai2, split by take as in the file or, for tuning, by file group."""
     people = motion.read_motion(file)
-    if section == TUNING:
+    if section != HELD_OUT:
         groups = ((clip, GROUPS.get(clip.labels["file_group"])) for clip in people)
         people = replace(people, clips=[replace(clip, split=split) for clip, split in groups if split])
     return SegmentData(str(file), people, **options)

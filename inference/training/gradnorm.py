@@ -47,8 +47,8 @@ class GradNorm:
         shared: prefix of the names of the parameters W, such as a last layer that all tasks use.
         others: objective that weighs all other terms, including the KL, and defines `draws` and `select`.
         asymmetry: a, how strongly the weights favour slowly training tasks. At 0, norms of gradients are equalised.
-            Above 0, losses must be positive; negative log densities need `lowest`. The paper uses 0.12, and 1.5 if tasks
-            differ more.
+            Above 0, losses must be positive; negative log densities need `lowest`. The paper uses 0.12, and 1.5 if
+            tasks differ more.
         learning_rate: learning rate of log w, the change per step for a task whose gradient has the mean norm; or of w.
         update: "relative" descends in log w, "published" in w. The second depends on the units of the losses.
         lowest: constants by task that are subtracted from L_i, so that training rates compare losses above their

@@ -79,8 +79,8 @@ class State:
 class SVI:
     """Stochastic variational inference step by step, for custom training loops; `fit` uses it.
 
-    On a CPU, steps on the batches that `fit` draws, `train.sample(svi.batch_size, svi.generator)`, repeat its numbers bit
-    for bit. `resuming` stores and restores a run.
+    On a CPU, steps on the batches that `fit` draws, `train.sample(svi.batch_size, svi.generator)`, repeat its numbers
+    bit for bit. `resuming` stores and restores a run.
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` accepts.
