@@ -20,10 +20,9 @@ import dvae
 from dvae import motion
 from dvae.data import Batch
 from dvae.data.batch import WHOLE
-from dvae.motion.segments.completion import SegmentCompletion
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import SHAPE, Segments
-from dvae.motion.segments.generation import Generated, aggregate_posterior, generate, summarise
+from dvae.motion.segments.generation import REAL, Generated, aggregate_posterior, generate, priors, summarise
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
@@ -40,7 +39,6 @@ PAIRS, STEPS = 200, 9
 FALLS = ("falls", "falls where the run is shorter")
 ERROR, DURATION = "vertex error", "duration error"
 KL, NORM, SPREAD = "KL", "latent norm", "latent deviation"
-STANDARD, FITTED, REAL = "N(0, I)", "fitted normal", "real"
 DRAWN = 500
 """Number of segments from each prior, on the bodies of test segments."""
 FULL, FIRST, SHAPED = "both phases", "first phase alone", "guide with beta"
@@ -81,11 +79,11 @@ def measured(model: Any, tests: Mapping[str, Segments], training: Segments, seed
 
 
 def drawn(model: Any, test: Segments, training: Segments, seed: int) -> dict[str, dict[str, float]]:
-    """Return means of statistics of segments from N(0, I), from a normal fitted to latents, and of test segments."""
+    """Return means of statistics of segments from N(0, I), from distributions of latents, and of test segments."""
     known, real = (Generated(model, batch[WHOLE], batch[SHAPE]) for batch in (training.all(), test.all()))
     bodies = real.shape[np.random.default_rng(seed).integers(len(test), size=DRAWN)]
-    fitted = SegmentCompletion(model, known=training.all()).prior
-    rows = {STANDARD: generate(model, bodies, seed=seed), FITTED: generate(model, bodies, prior=fitted, seed=seed)}
+    latents = priors(model, training.all())
+    rows = {name: generate(model, bodies, prior=prior, seed=seed) for name, prior in latents.items()}
     return summarise({**rows, REAL: real}, known)
 
 
@@ -173,9 +171,10 @@ def prior_table(cases: Mapping[str, Row]) -> Table:
     rows: dict[str, list[Mapping[str, float]]] = {}
     for case, row in cases.items():
         runs = [run for run in row.runs if "generated" in run] if row.name == OURS else []
-        for prior in (STANDARD, FITTED) if runs else ():
+        for prior in runs[0]["generated"] if runs else ():
             rows[f"{case}, {prior}"] = [{**run["generated"][prior], **run["posterior"]} for run in runs]
         if runs:
+            del rows[f"{case}, {REAL}"]
             rows[REAL] = [runs[0]["generated"][REAL]]
     rows[REAL] = rows.pop(REAL)  # the last row
     names = dict.fromkeys(name for each in rows.values() for name in each[0])

@@ -16,11 +16,19 @@ from .. import motion
 from ..data.batch import WHOLE
 from ..inference.diagnostics.posteriors import Descent
 from ..inference.training.checkpoints import CheckpointError
-from ..motion.segments.completion import TO_POINTS, Deviations, SegmentCompletion, simulate_observations
+from ..motion.segments.completion import TO_POINTS, Deviations, simulate_observations
 from ..motion.segments.dataset import subsample_clips
 from ..motion.segments.embodied import SHAPE
 from ..motion.segments.frames import resting_offsets
-from ..motion.segments.generation import Generated, aggregate_posterior, summarise, summary_table
+from ..motion.segments.generation import (
+    REAL,
+    STANDARD,
+    Generated,
+    aggregate_posterior,
+    priors,
+    summarise,
+    summary_table,
+)
 from ..motion.segments.generation import generate as generate_segments
 from ..motion.segments.recovery import Recovered, read_seen
 from ..motion.segments.recovery import recover as recover_segments
@@ -185,9 +193,9 @@ def generate(
 ) -> None:
     """Draw segments of motion from N(0, I), the prior of a run of motion-latent, and compare them with real ones.
 
-    Prints means of statistics, such as speed, contact and sliding of the feet, for segments from the prior, from a
-    normal distribution fitted to the latents of training segments, and for real test segments. Also prints how far the
-    latents of training segments are from N(0, I); if they are far, raise --kl of the fit.
+    Prints means of statistics, such as speed, contact and sliding of the feet, for segments from the prior, from two
+    distributions of the latents of training segments, and for real test segments. Also prints how far these latents are
+    from N(0, I); if they are far, raise --kl of the fit.
 
     Args:
         run: run directory.
@@ -213,21 +221,18 @@ def generate(
         parts = {name: test.on_bodies(part, shapes[name]) for name, part in parts.items()}
     real = {name: Generated(model, part[WHOLE], part[SHAPE]) for name, part in parts.items()}
     bodies = parts["real"][SHAPE].repeat(-(-samples // len(test)), 1)[:samples]
-    fitted = SegmentCompletion(model, known=parts["known"]).prior
     options: dict[str, Any] = {"seconds": seconds, "tolerance": tolerance, "seed": seed}
-    rows = {
-        "N(0, I)": generate_segments(model, bodies, **options),
-        "fitted normal": generate_segments(model, bodies, **options, prior=fitted),
-        "real": real["real"],
-    }
+    latents_by_name = priors(model, parts["known"])
+    rows = {name: generate_segments(model, bodies, **options, prior=prior) for name, prior in latents_by_name.items()}
+    rows[REAL] = real["real"]
     if out is not None:
-        _write_generated(out, rows["N(0, I)"], real["real"], shown)
+        _write_generated(out, rows[STANDARD], real["real"], shown)
     OUT.print(summary_table(summarise(rows, real["known"])))
     latents = aggregate_posterior(model, parts["known"])
     OUT.print(
         f"latents of {len(known)} training segments: KL {latents['KL']:.1f} nats, norm of means {latents['norm']:.2f}, "
-        f"deviation {latents['deviation']:.2f}; together they have {latents['radius']:.2f} of the radius of N(0, I), "
-        f"and {latents['aggregate KL']:.1f} nats from it",
+        f"deviation {latents['deviation']:.2f}; together they have {latents['radius']:.2f} of the radius of N(0, I), and "
+        f"are at least {max(latents['excess'], 0.0):.1f} nats from it",
         soft_wrap=True,
     )
 

@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import log
 from typing import Any
 
 import torch
@@ -24,15 +25,20 @@ from ...inference.evaluation.metrics import average_pairwise_distance
 from ...inference.evaluation.result import Table
 from ..data.clips import MotionSet
 from ..geometry import kinematics
+from .completion import TIMES, SegmentCompletion, _at_moments
 from .frames import OFFSETS
 
 STILL = 0.5
 """Speed in m/s below which the lower foot counts as in contact with the ground."""
 CENTRAL = 0.99
 """Probability of the central interval of real segments in which each statistic of a plausible segment lies."""
+MOMENTS = 30
+"""Number of evenly spaced times of a segment at which statistics are computed."""
 ROUNDS = 200
 """Maximum number of draws of z for each segment with a given duration."""
 APD, PLAUSIBLE = "APD (m)", "plausible (%)"
+STANDARD, FITTED, AGGREGATE, REAL = "N(0, I)", "fitted normal", "aggregate posterior", "real"
+"""Names of distributions of z, and of real segments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +57,7 @@ class Generated:
 
     @cached_property
     def statistics(self) -> Mapping[str, Tensor]:
-        """Statistics (B,) of the segments by name and unit.
+        """Statistics (B,) of the segments by name and unit, from 30 poses that are evenly spaced in time.
 
         * duration, and displacement of the root from the first to the last frame
         * speed: mean over joints and time; peak speed: maximum over joints and frames
@@ -63,8 +69,9 @@ class Generated:
         """
         timed, skeleton = self.model.timed, self.model.timed.skeleton
         durations = timed.lasts(self.x)
-        steps = timed.times(self.x).diff(dim=-1)
-        joints = self._joints
+        step = durations / (MOMENTS - 1)
+        times = torch.linspace(0, 1, MOMENTS).to(self.x) * durations[:, None]
+        joints = self._joints(_at_moments(timed, self.x, {TIMES: times})[0])
         ends = set(range(skeleton.joints)) - set(skeleton.parents)
         feet = [j for j in sorted(ends) if re.search("foot|toe", skeleton.names[j], re.IGNORECASE)]
         heights = joints[..., feet, skeleton.vertical]
@@ -73,14 +80,14 @@ class Generated:
         paths = moves.norm(dim=-1)
         foot = moves[..., feet, :].gather(-2, lowest)[..., 0, :]
         level = [axis for axis in range(3) if axis != skeleton.vertical]
-        contact = (foot.norm(dim=-1) < STILL * steps).to(steps) * steps
+        contact = (foot.norm(dim=-1) < STILL * step[:, None]).to(step)
         lengths = skeleton.bone_lengths(joints)
         return {
             "duration (s)": durations,
             "displacement (m)": timed.travels(self.x),
             "speed (m/s)": paths.mean(-1).sum(-1) / durations,
-            "peak speed (m/s)": (paths / steps[..., None]).amax((1, 2)),
-            "contact (%)": 100 * contact.sum(-1) / durations,
+            "peak speed (m/s)": paths.amax((1, 2)) / step,
+            "contact (%)": 100 * contact.mean(-1),
             "sliding (m/s)": foot[..., level].norm(dim=-1).sum(-1) / durations,
             "floor (cm)": 100 * heights.amin(-1).std(-1),
             "bone stretch (%)": 100 * (lengths.std(1) / lengths.mean(1)).mean(-1),
@@ -89,7 +96,7 @@ class Generated:
     @property
     def diversity(self) -> float:
         """APD in metres: mean distance between two segments, each the vector of all joint positions in all frames."""
-        return float(average_pairwise_distance(self._joints.flatten(2)))
+        return float(average_pairwise_distance(self._joints(self.x).flatten(2)))
 
     def plausible(self, real: Generated) -> Tensor:
         """Return whether every statistic is in the central 99 % of the statistics of real segments, as booleans (B,).
@@ -115,14 +122,36 @@ class Generated:
         clips = [replace(clip, name=f"sample-{n:02d}") for n, clip in enumerate(motion)]
         return replace(motion, clips=clips)
 
-    @cached_property
-    def _joints(self) -> Tensor:
-        """Positions of the joints, (B, N, J, 3) in metres."""
+    def _joints(self, frames: Tensor) -> Tensor:
+        """Return the positions (B, K, J, 3) of the joints in frames (B, K, D), in metres."""
         timed, body = self.model.timed, self.model.body
-        rotations, translation = timed.poses(self.x)
-        offsets = body.offsets(self.shape)[:, None].expand(-1, self.x.shape[1], -1, -1)
+        rotations, translation = timed.poses(frames)
+        offsets = body.offsets(self.shape)[:, None].expand(-1, frames.shape[1], -1, -1)
         positions: Tensor = kinematics.forward(body.parents, rotations, offsets, translation)[0]
         return positions
+
+
+def priors(model: Any, batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return distributions of z by name: the prior, and two that are estimated from the latents of segments.
+
+    "fitted normal" has the mean and covariance of the latents, as in `SegmentCompletion`. "aggregate posterior" is the
+    mixture of the posteriors of all segments.
+
+    Args:
+        model: model of segments.
+        batch: segments, x (B, N, D) and beta (B, S).
+    """
+    with seeded_evaluation(model, 0):
+        batch = on_device_of(model, batch)
+        posterior = model.posterior(batch)
+        components = torch.distributions.Independent(torch.distributions.Normal(posterior.mean, posterior.stddev), 1)
+        weights = torch.distributions.Categorical(logits=posterior.mean.new_zeros(len(posterior.mean)))
+        standard = torch.distributions.Normal(torch.zeros_like(posterior.mean[0]), 1.0)
+        return {
+            STANDARD: torch.distributions.Independent(standard, 1),
+            FITTED: SegmentCompletion(model, known=batch).prior,
+            AGGREGATE: torch.distributions.MixtureSameFamily(weights, components),
+        }
 
 
 def summarise(rows: Mapping[str, Generated], real: Generated) -> dict[str, dict[str, float]]:
@@ -213,6 +242,9 @@ def aggregate_posterior(model: Any, batch: Mapping[str, Any]) -> dict[str, float
         radius: root mean square norm of draws from the aggregate posterior, divided by that of the prior, sqrt(Z).
         aggregate KL: KL in nats from the prior of the normal with the mean and covariance of the aggregate posterior;
             0 if they match.
+        excess: lower bound in nats of the KL of the aggregate posterior of these segments from the prior, mean KL minus
+            log N, because z has at most log N nats about which of N segments it describes (Hoffman and Johnson 2016).
+            If it is far above 0, the prior does not generate such segments.
     """
     with seeded_evaluation(model, 0):
         posterior = model.posterior(on_device_of(model, batch))
@@ -226,5 +258,6 @@ def aggregate_posterior(model: Any, batch: Mapping[str, Any]) -> dict[str, float
         "norm": float(means.norm(dim=1).mean()),
         "deviation": float(variances.sqrt().mean()),
         "radius": float((total / size).sqrt()),
+        "excess": float(kl.mean()) - log(len(means)),
         "aggregate KL": float(0.5 * (total - size - torch.linalg.slogdet(covariance).logabsdet)),
     }

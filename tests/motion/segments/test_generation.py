@@ -51,7 +51,7 @@ def test_real_segments_are_plausible_and_others_are_not(segments, model):
     summary = summarise({"real": real, "prior": generate(model, real.shape)}, real)
     assert summary["real"]["plausible (%)"] > 100 * 0.3  # each of eight statistics excludes the two extremes
     assert summary["prior"]["plausible (%)"] == 0  # an untrained model
-    joints = real._joints.flatten(1)
+    joints = real._joints(real.x).flatten(1)
     assert summary["real"]["APD (m)"] == pytest.approx(float(torch.pdist(joints).mean()))
 
 
@@ -79,6 +79,7 @@ def test_the_aggregate_posterior_is_compared_with_the_prior(segments):
         kl = torch.distributions.kl_divergence(posterior, dist.Normal(torch.zeros(3).double(), 1.0)).sum(-1).mean()
         assert found["KL"] == pytest.approx(float(kl))
         assert found["norm"] == pytest.approx(float((spread * means).norm(dim=1).mean()))
+        assert found["excess"] == pytest.approx(float(kl) - math.log(4000))
         variance = spread**2 + deviation**2
         assert found["radius"] == pytest.approx(variance**0.5)
         expected = 1.5 * (variance - 1 - math.log(variance))
