@@ -231,8 +231,8 @@ def generate(
     latents = aggregate_posterior(model, parts["known"])
     OUT.print(
         f"latents of {len(known)} training segments: KL {latents['KL']:.1f} nats, norm of means {latents['norm']:.2f}, "
-        f"deviation {latents['deviation']:.2f}; together they have {latents['radius']:.2f} of the radius of N(0, I), and "
-        f"are at least {max(latents['excess'], 0.0):.1f} nats from it",
+        f"deviation {latents['deviation']:.2f}; together they have {latents['radius']:.2f} of the radius of N(0, I), "
+        f"and are at least {max(latents['excess'], 0.0):.1f} nats from it",
         soft_wrap=True,
     )
 
@@ -243,7 +243,7 @@ def _write_generated(out: Path, generated: Generated, real: Generated, shown: in
     if out.suffix.lower() in (".html", ".htm"):
         (first,) = replace(real, x=real.x[:1], shape=real.shape[:1]).motion()
         names = [*(f"from N(0, I), {n + 1}" for n in range(len(some))), "real"]
-        _save_page(out, replace(some, clips=[*some, first]), names)
+        _save_page(out, replace(some, clips=[*some, replace(first, name="real")]), names)
     else:
         _write_clips(out, some)
     ERROR.print(f"wrote {out}: {len(some)} segments from N(0, I)")
