@@ -19,15 +19,17 @@ import tyro
 import dvae
 from dvae import motion
 from dvae.data import Batch
+from dvae.data.batch import WHOLE
 from dvae.motion.segments.dataset import SegmentData
-from dvae.motion.segments.embodied import Segments
+from dvae.motion.segments.embodied import SHAPE, Segments
+from dvae.motion.segments.generation import REAL, Generated, aggregate_posterior, generate, priors, summarise
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
-from .engine import OURS, Row, budget, fit_or_load, folder, interval, measure, read, settings
+from .engine import OURS, Row, budget, fit_or_load, folder, interval, measure, read, settings, spread
 from .results import Table, tabled, write
 
-TUNING, HELD_OUT = "tuning", "held out"
+TUNING, HELD_OUT, PRIOR = "tuning", "held out", "prior"
 SAME, OTHER = "same source", "other source"
 GROUPS = {"A": "train", "B": "test"}
 """Splits of the file groups of bandai2 for tuning, which replace the split of the file."""
@@ -36,16 +38,19 @@ PAIRS, STEPS = 200, 9
 """Number of interpolated pairs of a walk and a run, and steps of each, including both ends."""
 FALLS = ("falls", "falls where the run is shorter")
 ERROR, DURATION = "vertex error", "duration error"
+KL, NORM, SPREAD = "KL", "latent norm", "latent deviation"
+DRAWN = 500
+"""Number of segments from each prior, on the bodies of test segments."""
 FULL, FIRST, SHAPED = "both phases", "first phase alone", "guide with beta"
 CASES = settings(__file__)
-SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD_OUT: CASES["named"]}
+SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD_OUT: CASES["named"], PRIOR: CASES["prior"]}
 
 
 @cache
 def segments(section: str, file: Path, **options: Any) -> SegmentData:
     """Read gait cycles of bandai2, split by take as in the file or, for tuning, by file group."""
     people = motion.read_motion(file)
-    if section == TUNING:
+    if section != HELD_OUT:
         groups = ((clip, GROUPS.get(clip.labels["file_group"])) for clip in people)
         people = replace(people, clips=[replace(clip, split=split) for clip, split in groups if split])
     return SegmentData(str(file), people, **options)
@@ -65,7 +70,21 @@ def measured(model: Any, tests: Mapping[str, Segments], training: Segments, seed
         )
         takes = [f"{split}/{take}" for split, _, take in reconstruction.segments]
         measurement[name] = {"clips": takes, "weights": [1] * len(takes), "rows": reconstruction.rows}
-    return {"tests": [*tests], **measurement, "interpolation": interpolated(model, next(iter(tests.values())), seed)}
+    test = next(iter(tests.values()))
+    generated = {
+        "posterior": aggregate_posterior(model, training.all()),
+        "generated": drawn(model, test, training, seed),
+    }
+    return {"tests": [*tests], **measurement, **generated, "interpolation": interpolated(model, test, seed)}
+
+
+def drawn(model: Any, test: Segments, training: Segments, seed: int) -> dict[str, dict[str, float]]:
+    """Return means of statistics of segments from N(0, I), from distributions of latents, and of test segments."""
+    known, real = (Generated(model, batch[WHOLE], batch[SHAPE]) for batch in (training.all(), test.all()))
+    bodies = real.shape[np.random.default_rng(seed).integers(len(test), size=DRAWN)]
+    latents = priors(model, training.all())
+    rows = {name: generate(model, bodies, prior=prior, seed=seed) for name, prior in latents.items()}
+    return summarise({**rows, REAL: real}, known)
 
 
 def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
@@ -128,6 +147,9 @@ SCORED: dict[str, Callable[[Row], str]] = {
     "median (mm)": lambda row: f"{np.median(errors(row)):.1f}",
     "duration error (ms)": lambda row: row.format_score(DURATION),
     "ELBO (nats/frame)": lambda row: row.format_score("ELBO"),
+    "KL (nats)": lambda row: row.format_score(KL),
+    "norm of mean": lambda row: row.format_score(NORM, 2),
+    "deviation": lambda row: row.format_score(SPREAD, 2),
 }
 INTERPOLATED = {name: partial(falling, name) for name in FALLS}
 
@@ -144,6 +166,22 @@ def difference_table(cases: Mapping[str, Row]) -> Table:
     return tabled(differences, {"vertex error (mm)": lambda each: f"{each.mean:.1f}", "95 %": interval})
 
 
+def prior_table(cases: Mapping[str, Row]) -> Table:
+    """Return a table of segments from the priors of each case, next to real segments; means and ranges over seeds."""
+    rows: dict[str, list[Mapping[str, float]]] = {}
+    for case, row in cases.items():
+        runs = [run for run in row.runs if "generated" in run] if row.name == OURS else []
+        for prior in runs[0]["generated"] if runs else ():
+            rows[f"{case}, {prior}"] = [{**run["generated"][prior], **run["posterior"]} for run in runs]
+        if runs:
+            del rows[f"{case}, {REAL}"]
+            rows[REAL] = [runs[0]["generated"][REAL]]
+    rows[REAL] = rows.pop(REAL)  # the last row
+    names = dict.fromkeys(name for each in rows.values() for name in each[0])
+    columns = {name: lambda each, name=name: spread([run.get(name) for run in each]) for name in names}
+    return tabled(rows, columns)
+
+
 def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
     """Return a section's two tables for each test set; interpolations are scored on the first only."""
     first, available = next(iter(cases.values())).runs[0], {}
@@ -154,6 +192,8 @@ def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
         name = f"motion_latent_4d/{folder(section)}-{folder(test)}"
         available[name] = tabled(rows, SCORED | (INTERPOLATED if test == SAME else {}), note=note)
         available[f"{name}-differences"] = difference_table(rows)
+    if any("generated" in run for row in cases.values() for run in row.runs):
+        available[f"motion_latent_4d/{folder(section)}-generated"] = prior_table(cases)
     return available
 
 

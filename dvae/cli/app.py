@@ -42,6 +42,7 @@ GROUPS = {
     "use": {
         "forecast": ("futures:forecast", "Draw forecasts, or motion along given paths of some joints."),
         "impute": ("futures:impute", "Draw missing values, or whole segments of motion from parts of them."),
+        "generate": ("segments:generate", "Draw whole segments of motion from the prior of a latent space."),
         "animate": ("futures:animate", "Play forecasts or a clip as moving skeletons."),
     },
     "assess": {

@@ -1,4 +1,4 @@
-"""Recovery of whole segments of motion, for `dvae impute`."""
+"""Whole segments of motion: their recovery for `dvae impute`, and `dvae generate`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,26 @@ from .. import motion
 from ..data.batch import WHOLE
 from ..inference.diagnostics.posteriors import Descent
 from ..inference.training.checkpoints import CheckpointError
-from ..motion.segments.completion import Deviations, simulate_observations
+from ..motion.segments.completion import TO_POINTS, Deviations, simulate_observations
 from ..motion.segments.dataset import subsample_clips
 from ..motion.segments.embodied import SHAPE
 from ..motion.segments.frames import resting_offsets
+from ..motion.segments.generation import (
+    REAL,
+    STANDARD,
+    Generated,
+    aggregate_posterior,
+    priors,
+    summarise,
+    summary_table,
+)
+from ..motion.segments.generation import generate as generate_segments
 from ..motion.segments.recovery import Recovered, read_seen
 from ..motion.segments.recovery import recover as recover_segments
 from ..options import Positive, Range, check
 from ..runs import directory as runs
 from . import loading
-from .console import ERROR, OUT, UsageError, check_files, note
+from .console import ERROR, OUT, Failed, UsageError, at_least, check_files, note
 from .help import Expert
 
 MOST_DRAWS = 100
@@ -117,6 +127,7 @@ class Recovery:
         source: names of segments, or of takes, whose first segment is used; split/name if a name is not unique.
         file: npz file of your own observations, instead of simulated ones.
         aggregate: use a normal distribution fitted to the latents of known segments as prior of z, instead of N(0, I).
+        two_way: for points: vertices far from all points are errors, too, as in a two-way Chamfer distance.
     """
 
     glimpse: Glimpse = Glimpse()
@@ -125,6 +136,7 @@ class Recovery:
     source: Annotated[tuple[str, ...], tyro.conf.arg(name="from")] = ()
     file: Path | None = None
     aggregate: Expert[bool] = True
+    two_way: Expert[bool] = False
 
     def run(self, run: Path, out: Path | None, draws: int, seed: int, data: str | None, failed: bool) -> None:
         """Recover segments, print the estimates with their uncertainty, and write them."""
@@ -155,7 +167,7 @@ class Recovery:
             )
         training_segments = None if data_set is None else _other_segments(data_set, takes)
         options: dict[str, Any] = {"truth": truth, "deviations": self.deviations, "known": training_segments}
-        options |= {"descent": self.descent, "aggregate": self.aggregate}
+        options |= {"descent": self.descent, "aggregate": self.aggregate, "two_way": self.two_way}
         recovered = recover_segments(model, seen, keys, **options, seed=seed, progress=True)
         for warning in _warnings(recovered, self.deviations):
             note(warning)
@@ -165,6 +177,76 @@ class Recovery:
             names = ", ".join(map("/".join, keys))
             ERROR.print(f"wrote {out}: {names}, the most probable" + f" and {drawn} draws of each" * (drawn > 0))
         OUT.print(recovered.table())
+
+
+def generate(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Path | None = None,
+    samples: int = 100,
+    seconds: Positive | None = None,
+    tolerance: Expert[Positive] = 0.05,
+    beta: tuple[float, ...] | None = None,
+    shown: Annotated[int, Range(1, MOST_DRAWS)] = 5,
+    seed: int = 0,
+    data: str | None = None,
+    failed: Expert[Failed] = False,
+) -> None:
+    """Draw segments of motion from N(0, I), the prior of a run of motion-latent, and compare them with real ones.
+
+    Prints means of statistics, such as speed, contact and sliding of the feet, for segments from the prior, from two
+    distributions of the latents of training segments, and for real test segments. Also prints how far these latents are
+    from N(0, I); if they are far, raise --kl of the fit.
+
+    Args:
+        run: run directory.
+        out: file for some segments: an npz, an html page with a real segment, or a folder of BVH files.
+        samples: number of segments in the statistics.
+        seconds: duration of the segments; by default the model draws it.
+        tolerance: largest difference of a duration from --seconds.
+        beta: shape of all bodies; by default segments have the bodies of test segments.
+        shown: number of segments in --out.
+        seed: seed of the draws.
+        data: where the data are now, if the path in the run is no longer valid; or other data.
+    """
+    at_least(2, samples=samples)
+    check_files(out, None, ".npz", ".html", ".htm", "")
+    loaded = loading.load_run(run, data, ("segments",), failed)
+    model, data_set = loaded.model, loading.data_of(data, loaded)
+    known, test = data_set.windows("train"), data_set.windows("test")
+    parts = {"known": known.all(), "real": test.all()}
+    if beta is not None:
+        if len(beta) != (size := model.body.parameters_of_shape):
+            raise UsageError(f"--beta has {len(beta)} numbers, expected {size}")
+        shapes = {name: torch.tensor(beta).expand(len(part[SHAPE]), -1) for name, part in parts.items()}
+        parts = {name: test.on_bodies(part, shapes[name]) for name, part in parts.items()}
+    real = {name: Generated(model, part[WHOLE], part[SHAPE]) for name, part in parts.items()}
+    bodies = parts["real"][SHAPE].repeat(-(-samples // len(test)), 1)[:samples]
+    options: dict[str, Any] = {"seconds": seconds, "tolerance": tolerance, "seed": seed}
+    latents_by_name = priors(model, parts["known"])
+    rows = {name: generate_segments(model, bodies, **options, prior=prior) for name, prior in latents_by_name.items()}
+    rows[REAL] = real["real"]
+    if out is not None:
+        _write_generated(out, rows[STANDARD], real["real"], shown)
+    OUT.print(summary_table(summarise(rows, real["known"])))
+    latents = aggregate_posterior(model, parts["known"])
+    OUT.print(
+        f"latents of {len(known)} training segments: KL {latents['KL']:.1f} nats, norm of means {latents['norm']:.2f}, "
+        f"deviation {latents['deviation']:.2f}; together they have {latents['radius']:.2f} of the radius of N(0, I), "
+        f"and are at least {max(latents['excess'], 0.0):.1f} nats from it",
+        soft_wrap=True,
+    )
+
+
+def _write_generated(out: Path, generated: Generated, real: Generated, shown: int) -> None:
+    """Write some generated segments; a page also shows a real one."""
+    some = replace(generated, x=generated.x[:shown], shape=generated.shape[:shown]).motion()
+    if out.suffix.lower() in (".html", ".htm"):
+        (first,) = replace(real, x=real.x[:1], shape=real.shape[:1]).motion()
+        names = [*(f"from N(0, I), {n + 1}" for n in range(len(some))), "real"]
+        _save_page(out, replace(some, clips=[*some, replace(first, name="real")]), names)
+    else:
+        _write_clips(out, some)
+    ERROR.print(f"wrote {out}: {len(some)} segments from N(0, I)")
 
 
 def _known_data(run: runs.Loaded, data: str | None) -> Any:
@@ -192,6 +274,8 @@ def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:
             "nats left; give more --steps or --starts, or allow larger deviations"
         )
     for name, distances in recovered.distances.items():
+        if name == TO_POINTS:  # few points are far from most of the surface
+            continue
         option, allowed = name.removesuffix("s"), deviations.of(name)
         deviation = float(distances.max()) / (8 / pi) ** 0.5  # the mean length of three normal coordinates
         if deviation > FARTHER * allowed:
@@ -205,13 +289,19 @@ def _warnings(recovered: Recovered, deviations: Deviations) -> Iterator[str]:
 def _write_recovered(out: Path, recovered: Recovered, draws: int) -> None:
     """Write the most probable segments, and draws of them, as a motion file, an html page, a BVH file or a folder."""
     motions, suffix = recovered.motion(draws), out.suffix.lower()
-    if suffix == ".npz":
-        motion.write_motion(out, motions)
-    elif suffix in (".html", ".htm"):
+    if suffix in (".html", ".htm"):
         names = ["most probable", *(f"draw {n}" for n in range(1, draws + 1))]
         _save_page(out, motions, names, recovered.true_motion())
-    elif suffix:
+    elif suffix == ".bvh":
         motion.write_motion(out, _single_clip(motions, motions.clips[0]))
     else:
-        for clip in motions:
-            motion.write_motion(out, _single_clip(motions, clip), "bvh")
+        _write_clips(out, motions)
+
+
+def _write_clips(out: Path, motions: motion.MotionSet) -> None:
+    """Write clips as a motion file, or as a folder of BVH files."""
+    if out.suffix:
+        motion.write_motion(out, motions)
+        return
+    for clip in motions:
+        motion.write_motion(out, _single_clip(motions, clip), "bvh")

@@ -26,6 +26,7 @@ from .segments.dataset import SegmentData
 from .segments.embodied import Segments
 from .segments.frames import TimedFrames
 from .segments.gait import Cycles, gait_cycles, reference_cycles
+from .segments.generation import generate
 from .segments.interpolation import Interpolation, falls, interpolate, latent_map, transfer
 from .segments.reconstruction import reconstruct_segments
 
@@ -62,6 +63,7 @@ __all__ = [
     "estimate_angle_limits",
     "falls",
     "gait_cycles",
+    "generate",
     "interpolate",
     "is_forecasts",
     "latent_map",

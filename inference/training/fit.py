@@ -479,7 +479,7 @@ def _train(
     unchecked = isinstance(model, DynamicalVAE) and like(model).dtype is not torch.float64
     stop = False
     while state.status == "running":
-        batch = source.sample(training.batch_size, svi.generator)
+        batch = source.sample(svi.batch_size, svi.generator)
         if unchecked:  # only once, as the check synchronises with the device
             check_scale(batch, {WHOLE, *model.observed})
             unchecked = False

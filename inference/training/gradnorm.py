@@ -12,7 +12,8 @@ w:
 
     log w_i <- log w_i - rate sign(G_i - Gbar r_i^a) G_i / Gbar
 
-Weights are then positive without clipping, and the rate does not depend on the units of the losses.
+Weights are then positive without clipping, and the rate does not depend on the units of the losses. The published
+update, w_i <- w_i - rate sign(G_i - Gbar r_i^a) G_i / w_i, is an option.
 """
 
 from collections.abc import Callable, Mapping
@@ -46,13 +47,17 @@ class GradNorm:
         shared: prefix of the names of the parameters W, such as a last layer that all tasks use.
         others: objective that weighs all other terms, including the KL, and defines `draws` and `select`.
         asymmetry: a, how strongly the weights favour slowly training tasks. At 0, norms of gradients are equalised.
-            Above 0, losses must be positive; negative log densities may violate this. The paper uses 0.12, and 1.5 if
+            Above 0, losses must be positive; negative log densities need `lowest`. The paper uses 0.12, and 1.5 if
             tasks differ more.
-        learning_rate: learning rate of log w, the change per step for a task whose gradient has the mean norm.
+        learning_rate: learning rate of log w, the change per step for a task whose gradient has the mean norm; or of w.
+        update: "relative" descends in log w, "published" in w. The second depends on the units of the losses.
+        lowest: constants by task that are subtracted from L_i, so that training rates compare losses above their
+            minimum. For a normal with fixed deviation s of D numbers, D log(s sqrt(2 pi)) leaves the squared error.
 
     Raises:
         ValueError: with fewer than two tasks, or a repeated one; on the first call, if a task is not such a term or
-            does not depend on the shared parameters; before training, if the model has no such parameters.
+            does not depend on the shared parameters; before training, if the model has no such parameters; in
+            training, if the published update makes a weight negative.
 
     Example:
         >>> weighing = dvae.GradNorm(("pose", "time"), shared="generator.x.", others=dvae.Evidence(kl_weight=0.01))
@@ -66,9 +71,13 @@ class GradNorm:
     others: Evidence = field(default_factory=Evidence)
     asymmetry: Annotated[float, Range(0, 10)] = 0.12
     learning_rate: Share = 0.025
+    update: Literal["relative", "published"] = "relative"
+    lowest: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check(self)
+        if unknown := self.lowest.keys() - {*self.tasks}:
+            raise ValueError(f"`lowest` includes {min(unknown)!r}, but the tasks are {', '.join(self.tasks)}")
         if len(set(self.tasks)) != len(self.tasks) or len(self.tasks) < 2:
             raise ValueError(f"tasks must be two or more different names, got {', '.join(self.tasks) or 'none'}")
 
@@ -124,7 +133,7 @@ class GradNorm:
                 f"`tasks` includes {', '.join(map(repr, unknown))}, but the log-likelihoods and energies are "
                 f"{', '.join(costs) or 'none'}; set the weights of all other terms in others"
             )
-        return [costs[task].sum() / terms.n_steps.sum() for task in self.tasks]
+        return [costs[task].sum() / terms.n_steps.sum() - self.lowest.get(task, 0.0) for task in self.tasks]
 
     def begin(self, model: nn.Module) -> "Balance":
         """Return the objective for a stage of a run, with its own weights, which start at 1.
@@ -146,7 +155,8 @@ class GradNorm:
 
     def to_config(self) -> dict[str, Any]:
         """Return the objective as a JSON object."""
-        config = vars(self) | {"tasks": list(self.tasks), "others": self.others.to_config()}
+        config = vars(self) | {"tasks": list(self.tasks), "lowest": dict(self.lowest)}
+        config["others"] = self.others.to_config()
         return {"objective": "GradNorm"} | config
 
 
@@ -191,7 +201,8 @@ class Balance:
             mean: function that averages a tensor over the processes.
 
         Raises:
-            ValueError: when the training rate of a loss is not defined, because the loss is not positive.
+            ValueError: when the training rate of a loss is not defined, because the loss is not positive; or when the
+                published update makes a weight negative.
         """
         norms = torch.linalg.vector_norm(mean(measured["gradients"]), dim=1, dtype=torch.float64)
         losses, norms = torch.stack([mean(measured["losses"]).double(), norms]).cpu()  # one synchronisation
@@ -200,16 +211,26 @@ class Balance:
             if asymmetry and (start <= 0 or now < 0):
                 raise ValueError(
                     f"the loss of {task} is {now:.4g}, and was {start:.4g} at first, but training rates need positive "
-                    "losses; set asymmetry=0, which does not use training rates"
+                    "losses; give their minimum as `lowest`, or set asymmetry=0, which does not use training rates"
                 )
         self.first = first
         smallest = torch.finfo(torch.float64).tiny  # if all losses or all gradients are 0
         ratios = losses / first if asymmetry else torch.ones_like(losses)
-        norms = self.task_weights * norms
-        target = norms.mean() * (ratios / ratios.mean().clamp(min=smallest)) ** asymmetry
-        move = torch.sign(norms - target) * norms / norms.mean().clamp(min=smallest)
-        logarithms = self.task_weights.log() - self.objective.learning_rate * move
-        self.task_weights = torch.softmax(logarithms, 0) * len(logarithms)
+        weighted = self.task_weights * norms
+        target = weighted.mean() * (ratios / ratios.mean().clamp(min=smallest)) ** asymmetry
+        direction, rate = torch.sign(weighted - target), self.objective.learning_rate
+        if self.objective.update == "relative":
+            move = direction * weighted / weighted.mean().clamp(min=smallest)
+            self.task_weights = torch.softmax(self.task_weights.log() - rate * move, 0) * len(move)
+            return
+        weights = self.task_weights - rate * direction * norms
+        if not (weights > 0).all():
+            row = dict(zip(self.objective.tasks, weights.tolist(), strict=True))
+            raise ValueError(
+                f"the published update makes the weight of {min(row, key=row.__getitem__)} {min(row.values()):.3g}; "
+                "give a lower learning_rate, or update='relative', whose weights are positive"
+            )
+        self.task_weights = weights * len(weights) / weights.sum()
 
     @property
     def row(self) -> dict[str, float]:

@@ -105,10 +105,12 @@ class Stage:
         curriculum: progress, from 0 to 1, of parts that are introduced gradually, such as draws of variables that
             sequences share (`distributions.Subset`); None for 1.
         frozen: prefixes of names of parameters that are not trained.
+        batch_size: number of sequences in a batch, in each process; None for the value in `Training`, which also
+            applies to validation.
 
     Raises:
         TypeError: `objective` is a class instead of an instance.
-        ValueError: `steps` is less than 1, or the curriculum leaves the range from 0 to 1.
+        ValueError: `steps` or `batch_size` is less than 1, or the curriculum leaves the range from 0 to 1.
 
     Example:
         >>> import dvae
@@ -121,12 +123,15 @@ class Stage:
     scheduled_sampling: float | Schedule | None = None
     curriculum: float | Schedule | None = None
     frozen: tuple[str, ...] = ()
+    batch_size: int | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.objective, type):
             raise TypeError(f"objective must be an instance such as dvae.Evidence(), got {kind_of(self.objective)}")
         if self.steps < 1:
             raise ValueError(f"a stage needs at least 1 step, got {self.steps}")
+        if self.batch_size is not None and self.batch_size < 1:
+            raise ValueError(f"the batch_size of a stage must be at least 1, got {self.batch_size}")
         for value in () if self.curriculum is None else levels(self.curriculum):
             if value not in Range(0, 1):
                 raise ValueError(f"the curriculum of a stage must be between 0 and 1, got {value}")

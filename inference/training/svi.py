@@ -79,8 +79,8 @@ class State:
 class SVI:
     """Stochastic variational inference step by step, for custom training loops; `fit` uses it.
 
-    On a CPU, steps on the batches that `fit` draws, `train.sample(batch_size, svi.generator)`, repeat its numbers bit
-    for bit. `resuming` stores and restores a run.
+    On a CPU, steps on the batches that `fit` draws, `train.sample(svi.batch_size, svi.generator)`, repeat its numbers
+    bit for bit. `resuming` stores and restores a run.
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` accepts.
@@ -166,6 +166,11 @@ class SVI:
                 first: described.begin(self.model) if isinstance(described, AdaptiveObjective) else described
             }
         return self._stage_objective[first]
+
+    @property
+    def batch_size(self) -> int:
+        """Number of sequences in the batch of the next step, in each process."""
+        return stage_at(self.plan, self.state.step)[1].batch_size or self.training.batch_size
 
     @torch.inference_mode(False)
     def init(self) -> State:

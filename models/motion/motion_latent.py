@@ -12,24 +12,28 @@ Training has two phases. The first minimises squared errors of rotations, transl
 squared errors of the vertices of the surface and of time. In both, the weights of the errors adapt (`dvae.GradNorm`),
 and the KL has its own weight.
 
-Marsot, Wuhrer, Franco and Durocher, 2021, arXiv 2106.04387; there is no public code. Our choices where the paper gives
-no detail:
+Marsot, Wuhrer, Franco and Durocher, 2021, arXiv 2106.04387; there is no public code. The option `published` trains as
+the paper: 5,000 epochs of the first phase with batches of 256 and a learning rate of 1e-3, then 200 epochs with 16 and
+1e-4; squared errors are summed over joints, vertices and frames, and their weights adapt to the decrease of each error.
+The paper does not give, and we choose:
 
-* The widths of the layers, and one batch size for both phases.
-* Likelihoods are normal; their scale replaces the unknown reduction of the squared errors relative to the KL.
-* Weights adapt by the gradients of the last layer that all tasks share.
-* GradNorm makes these gradients equal (asymmetry 0), because log-likelihoods have no zero as a reference for their
-  decrease.
+* The widths of the layers, here one layer of 256.
+* The reduction of the squared errors, to which the KL is relative. Averages would be so small, next to the KL, that the
+  latent would carry nothing, so we read sums.
+* The asymmetry of GradNorm, here 0.12 as in its own paper, the learning rate of the weights, and the layer whose
+  gradients they balance, here the last one that all tasks share. We call the KL squared where the paper does; it is the
+  usual KL.
 
-The learning rate of the second phase and its share of the steps suit short runs
-(benchmarks/results/motion_latent_4d); the paper has 1e-4 and 200 of 5200 epochs.
+Without `published`, training suits short runs (benchmarks/results/motion_latent_4d): normal likelihoods, whose scales
+replace the reduction; weights that equalise gradients (asymmetry 0); and one batch size for both phases.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from math import log, pi, sqrt
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from pyro import poutine
@@ -42,19 +46,30 @@ from ...distributions import DistributionSpec, FixedNormal
 from ...factorization.notation import Factorization
 from ...inference.training.gradnorm import GradNorm
 from ...inference.training.objectives import Evidence
-from ...inference.training.options import Stage
+from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...motion.bodies import Body, reopen_body
 from ...motion.segments.embodied import SHAPE, SegmentSchema, surfaces_of
 from ...networks import NetworkSpec, WholeDecoder, WholeEncoder
 from ...networks.base import share_modules
-from ...options import Amount, Positive, Share, Size
+from ...options import Amount, Positive, Range, Share, Size
 from ...program.model import DynamicalVAE
 from ...program.rollout import Rollout
 from ..method import Method
 
 ROTATIONS, TRANSLATION, TIME, SURFACE = "rotations", "translation", "time", "surface"
 PARTS = (ROTATIONS, TRANSLATION, TIME)
+
+EPOCHS = 5000 * 52, 200 * 821
+"""Steps of the two phases in the paper: epochs times batches of 256 and 16 that its 13,121 segments take."""
+PRESETS: dict[str, dict[str, Any]] = {
+    "published": {
+        **{"scale": 0.5**0.5, "deviation": (2 * 6890) ** -0.5, "asymmetry": 0.12},
+        **{"finish": EPOCHS[1] / sum(EPOCHS), "finish_rate": 1e-4, "finish_batch": 16},
+    },
+    "": {"scale": 0.1, "deviation": 0.05, "asymmetry": 0.0, "finish": 0.4, "finish_rate": 3e-4},
+}
+"""Defaults as in the paper, and for short runs."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +80,18 @@ class MotionLatent(Method):
         latent: size of z.
         widths: widths of the encoder's layers; the decoder has them in reverse order.
         shaped: whether the guide reads beta.
-        kl: weight of the KL.
-        scale: standard deviation of all numbers of chi.
-        deviation: standard deviation of a vertex, in metres.
+        kl: weight of the KL. At the default, posteriors are too far apart for N(0, I) to generate motion; PRIORKL.
+        published: train as in the paper, with its number of steps for 13,121 segments. This changes the defaults of the
+            options below.
+        scale: standard deviation of all numbers of chi; None, here and below, for the default. The published value
+            makes the negative log density the sum of squared errors.
+        deviation: standard deviation of a vertex, in metres. The published value makes the energy the sum of squared
+            errors of the 6,890 vertices of SMPL, for a body with any number of vertices.
         finish: share of training in the second phase; 0 for the first phase alone, 1 for the second alone.
         finish_rate: learning rate of the second phase.
+        finish_batch: batch size of the second phase; None for the batch size of the first if not `published`.
+        asymmetry: how strongly the adaptive weights favour errors that decrease slowly, as in `dvae.GradNorm`; at 0,
+            gradients are equalised. Errors are then log densities, otherwise squared errors.
         pace: learning rate of the adaptive weights; 0 to keep them at 1.
     """
 
@@ -78,17 +100,34 @@ class MotionLatent(Method):
     generative = "p(z) p(rotations_t | z, beta) p(translation_t | z, beta) p(time_t | z, beta)"
     inference = "q(z | rotations_{1:T}, translation_{1:T}, time_{1:T})"
     fitted_on = "segments"
+    presets = PRESETS
+    trainings: ClassVar[Mapping[str, Training]] = {
+        "published": Training(sum(EPOCHS), 256, 1e-3, gradient_clip=None),
+        "": Training(decay=0.5),
+    }
     exact: ClassVar[str] = "q(z | rotations_{1:T}, translation_{1:T}, time_{1:T}, beta)"
 
     latent: Size = 64
     widths: tuple[Size, ...] = (256,)
     shaped: bool = False
     kl: Amount = 0.01
-    scale: Positive = 0.1
-    deviation: Positive = 0.05
-    finish: Share = 0.4
-    finish_rate: Positive = 3e-4
+    published: bool = False
+    scale: Positive | None = None
+    deviation: Positive | None = None
+    finish: Share | None = None
+    finish_rate: Positive | None = None
+    finish_batch: Size | None = None
+    asymmetry: Annotated[float, Range(0, 10)] | None = None
     pace: Share = 0.025
+
+    @override
+    def resolve_defaults(self, data: Any) -> Self:
+        preset = self.presets["published" if self.published else ""]
+        return replace(self, **{name: value for name, value in preset.items() if getattr(self, name) is None})
+
+    @override
+    def training(self, data: Any) -> Training:
+        return self.trainings["published" if self.published else ""]
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
@@ -97,7 +136,9 @@ class MotionLatent(Method):
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
-        return {f"p({name})": FixedNormal(self.scale, project=False, error_weight=True) for name in PARTS}
+        scale = self.resolve_defaults(None).scale
+        assert scale is not None
+        return {f"p({name})": FixedNormal(scale, project=False, error_weight=True) for name in PARTS}
 
     @override
     def build(self, data: Any) -> DynamicalVAE:
@@ -119,7 +160,7 @@ class MotionLatent(Method):
         }
         model_arguments |= {"network": networks, "distributions": self.distributions()}
         model = (
-            MotionLatentModel(self, schema, reopen_body(schema.body), **model_arguments)
+            MotionLatentModel(self.resolve_defaults(data), schema, reopen_body(schema.body), **model_arguments)
             if isinstance(schema, SegmentSchema)
             else DynamicalVAE(**model_arguments, observed=PARTS)
         )
@@ -129,21 +170,33 @@ class MotionLatent(Method):
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
         """Return two stages with adaptive weights: errors of chi, then of surface and time; omit empty stages."""
-        second = round(self.finish * steps) if isinstance(Schema.of(train), SegmentSchema) else 0
+        method, schema = self.resolve_defaults(train), Schema.of(train)
+        assert method.finish is not None
+        second = round(method.finish * steps) if isinstance(schema, SegmentSchema) else 0
         first = Evidence(kl_weight=self.kl, select="loss")
         others = replace(first, likelihood_weight=0.0, draws={"z": 1})
-        phases = [(steps - second, PARTS, first, None), (second, (SURFACE, TIME), others, self.finish_rate)]
         stages = [
-            Stage(n_steps, self._balance(tasks, objective), rate)
-            for n_steps, tasks, objective, rate in phases
-            if n_steps
+            Stage(steps - second, method._balance(PARTS, schema, first)) if second < steps else None,
+            Stage(
+                second,
+                method._balance((SURFACE, TIME), schema, others),
+                method.finish_rate,
+                batch_size=method.finish_batch,
+            )
+            if second
+            else None,
         ]
-        return Recipe(train, validation, stages)
+        return Recipe(train, validation, [stage for stage in stages if stage is not None])
 
-    def _balance(self, tasks: tuple[str, ...], others: Evidence) -> GradNorm:
+    def _balance(self, tasks: tuple[str, ...], schema: Schema, others: Evidence) -> GradNorm:
+        """Return the objective with adaptive weights of these errors."""
+        assert self.scale is not None
+        assert self.asymmetry is not None
         last = 2 * len(self.widths) - 2  # each row of the next layer belongs to one task
         shared = f"generator.{ROTATIONS}.network.trunk.hidden.{last}."
-        return GradNorm(tasks, shared, others, asymmetry=0.0, learning_rate=self.pace)
+        lowest = {name: schema.size(name) * log(self.scale * sqrt(2 * pi)) for name in tasks if name in PARTS}
+        asymmetric: dict[str, Any] = {"asymmetry": self.asymmetry, "lowest": lowest if self.asymmetry else {}}
+        return GradNorm(tasks, shared, others, learning_rate=self.pace, **asymmetric)
 
 
 class MotionLatentModel(DynamicalVAE):
@@ -218,6 +271,7 @@ class MotionLatentModel(DynamicalVAE):
         with torch.no_grad():
             target = self._unpack(data)
         error = self.body.squared_error(data[SHAPE], predicted, target).sum(-1)
+        assert self.method.deviation is not None
         return {SURFACE: error / (2 * self.method.deviation**2)}
 
     def _unpack(self, parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:

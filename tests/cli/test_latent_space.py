@@ -243,3 +243,16 @@ def test_a_config_out_of_range_is_an_error(run, keys, value, message):
     change(run, keys, value)
     with pytest.raises(dvae.inference.training.checkpoints.CheckpointError, match=message):
         dvae.load(run)
+
+
+def test_segments_are_generated_from_the_prior(capsys, folder, tmp_path):
+    run, page = str(folder / "run"), tmp_path / "a.html"
+    assert main(["generate", run, "--samples", "6", "--shown", "2", "--out", str(page)]) == 0
+    output = capsys.readouterr().out
+    assert all(word in output for word in ("N(0, I)", "fitted normal", "real", "sliding", "APD", "plausible", "KL"))
+    assert all(name in page.read_text() for name in ("from N(0, I), 2", "real"))
+    fixed = ["--seconds", "2", "--tolerance", "2", "--beta", *["0.5"] * 8, "--samples", "3"]
+    assert main(["generate", run, *fixed, "--out", str(tmp_path / "a.npz")]) == 0
+    assert [clip.name for clip in motion.read_motion(tmp_path / "a.npz")] == [f"sample-0{n}" for n in range(3)]
+    assert "--beta has 1 numbers, expected 8" in failure(capsys, "generate", run, "--beta", "1", code=2)
+    assert "draws from the prior last 9 ± 0.05 s" in failure(capsys, "generate", run, "--seconds", "9")

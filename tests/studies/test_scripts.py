@@ -281,6 +281,7 @@ def test_motion_latent(tmp_path, out, monkeypatch):
     clips = [replace(clip, labels=labels) for clip, labels in zip(people, labels_by_clip, strict=True)]
     motion.save(tmp_path / "people.npz", replace(people, clips=clips))
     monkeypatch.setattr(motion_latent, "PAIRS", 4)
+    monkeypatch.setattr(motion_latent, "DRAWN", 4)
     for cases in motion_latent.SECTIONS.values():
         for name, case in cases.items():
             options = {"widths": (8,), **case.get("method", {})}
@@ -301,6 +302,11 @@ def test_motion_latent(tmp_path, out, monkeypatch):
     assert [row[0] for row in same[1:]] == ["both phases", "first phase alone", "PCA of 12"]
     assert [row[0] for row in against[1:]][1] == "both phases minus PCA of 12"
     assert other[1][1] != same[1][1]
+    main(**data, sections=("prior",), cases=("KL 1",), seeds=(0,), **options)
+    (generated,) = tables(out, "motion_latent_4d/prior-generated")
+    names = ["KL 1, N(0, I)", "KL 1, fitted normal", "KL 1, aggregate posterior", "real"]
+    assert [row[0] for row in generated[1:]] == names
+    assert [row[-1] == "–" for row in generated[1:]] == [False, False, False, True]  # only models have latents
 
 
 def test_completion(tmp_path, out, short, monkeypatch):
@@ -330,8 +336,19 @@ def test_completion(tmp_path, out, short, monkeypatch):
     assert (tmp_path / "a.png").stat().st_size > 10_000
     monkeypatch.setattr(completion, "TUNED_DEVIATIONS", {"surface": (0.01,), "marker": (), "point": ()})
     monkeypatch.setattr(completion, "DESCENTS", [])
-    completion.main("simulated", (), tmp_path / "a", parts=("tuning",), **{**options, "results": None})
+    shutil.copytree(tmp_path / "a", tmp_path / "KL-1-0")
+    completion.main("simulated", (), (tmp_path / "KL-1-0",), parts=("tuning", "claim"), **options)
     assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2
+    (claimed,) = tables(out, "motion_latent_4d/prediction-claim")
+    names = (
+        "KL-1",
+        "KL-1, reconstruction",
+        "residual-sup",
+        "last frame held",
+        "KL-1 minus residual-sup, 95 %",
+        "segments",
+    )
+    assert [row[0] for row in claimed[1:]] == [*names]
     with pytest.raises(SystemExit, match="unknown part 'guesses'"):
         completion.main(parts=("guesses",), **options)
 

@@ -21,10 +21,12 @@ The paper adds squared errors with adaptive weights. Here the squared errors are
 distributions, and the `Deviations` act as weights. The minimum of their sum is therefore the mode of a posterior, which
 also gives the uncertainty of a completion.
 
-For points, the error is the distance of each point to the nearest vertex. The error is one-sided: a vertex far from all
-points is not an error, because points may be few. These errors do not define a density of points, so the evidence
-cannot compare bodies by points. The curvature of the posterior treats the nearest vertices as fixed, which overstates
-the information in points; a high k-hat reveals this.
+For points, the error is the distance of each point to the nearest vertex. By default the error is one-sided: a vertex
+far from all points is not an error, because points may be few. With `two_way`, each vertex also has an error, the
+distance to the nearest observed point of its frame, as in a Chamfer distance; both directions have the same total
+weight. The paper does not say which Chamfer distance it uses. These errors do not define a density of points, so the
+evidence cannot compare bodies by points. The curvature of the posterior treats the nearest vertices as fixed, which
+overstates the information in points; a high k-hat reveals this.
 
 The surface of a frame counts as a single vertex with the mean squared error of all vertices, because errors of
 neighbouring vertices are correlated.
@@ -56,8 +58,10 @@ LATENT = "z"
 TIMES, FRAMES, SURFACES, POINTS, SPOTS = "times", "frames", "surfaces", "points", "markers"
 TIME = slice(-1, None)
 """Slice of a frame's coordinates that selects its time increment."""
-NEAREST = "nearest"
-"""Name of the indices (B, K, M) of the vertices nearest to points."""
+NEAREST, NEAREST_POINTS = "nearest", "nearest points"
+"""Names of the indices (B, K, M) of the vertices nearest to points, and (B, K, V) of the points nearest to vertices."""
+TO_POINTS = "surface to points"
+"""Name of the distances of vertices from the nearest points."""
 AT_ONCE, PAIRS = 32, 2**20
 """Maximum number of frames whose vertices are all in memory, and of pairs of a point and a vertex compared at once.
 
@@ -109,6 +113,7 @@ class SegmentCompletion:
         aggregate: whether to estimate the prior of z from `known`. The prior is then a normal distribution with the
             mean and covariance of the guide's latents for all known segments, instead of N(0, I). The two differ if the
             model was trained with a small KL weight. Without `known`, the prior is N(0, I).
+        two_way: whether vertices far from all points are errors, too.
     """
 
     model: Any
@@ -116,6 +121,7 @@ class SegmentCompletion:
     markers: Sequence[int] = tuple(MARKERS.values())
     known: Mapping[str, Any] | None = None
     aggregate: bool = True
+    two_way: bool = False
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Tensor]:
         """Sample z from `prior` and beta from N(0, I), and score the observations given the decoded motion.
@@ -135,12 +141,16 @@ class SegmentCompletion:
                 if SHAPE in observations
                 else pyro.sample(SHAPE, _standard(parameters, kind).expand([size]))
             )
-            times, decoded = self._decode(z, shape, observations)
+            times, decoded = self._decode(z, shape, observations, self.two_way)
             if TIMES in observations:
                 _observe(TIMES, times, observations[TIMES], deviations.time)
             for name, value in decoded.items():
-                counts = value.shape[-2] if name == SURFACES else 1  # as one vertex
-                _observe(name, value, observations[name], deviations.of(name) * counts**0.5)
+                if name != TO_POINTS:
+                    counts = value.shape[-2] if name == SURFACES else 1  # as one vertex
+                    _observe(name, value, observations[name], deviations.of(name) * counts**0.5)
+                else:  # all vertices of a frame weigh as much as its points
+                    counts = value.shape[-2] / observations[POINTS].shape[-2]
+                    _observe(name, value, _near_points(value, observations), deviations.point * counts**0.5)
         return {LATENT: z, SHAPE: shape}
 
     @cached_property
@@ -164,12 +174,14 @@ class SegmentCompletion:
             shape: (B, S).
 
         Returns:
-            Mapping from "surfaces", "points" or "markers" to the distances; for points, to the nearest vertex.
+            Mapping from "surfaces", "points" or "markers" to the distances; for points, to the nearest vertex. With
+            points, "surface to points" has the distances from vertices to the nearest point of their frame.
         """
-        decoded = self._decode(z, shape, observations)[1]
-        return {
-            name: (value - observations[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, value in decoded.items()
-        }
+        decoded = self._decode(z, shape, observations, True)[1]
+        targets = dict(observations)
+        if TO_POINTS in decoded:
+            targets[TO_POINTS] = _near_points(decoded[TO_POINTS], observations)
+        return {name: (value - targets[name]).norm(dim=-1).flatten(1).nanmean(-1) for name, value in decoded.items()}
 
     def guide(self, observations: Mapping[str, Any]) -> Any:
         """Sample z from the model's guide for randomly chosen known segments, one for each observed segment.
@@ -182,7 +194,7 @@ class SegmentCompletion:
         return self.model.guide({name: value[rows] for name, value in self.known.items()})
 
     def renewed(self, observations: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the observations with updated indices of the vertices nearest to points.
+        """Return the observations with updated indices of nearest vertices and, with `two_way`, of nearest points.
 
         Args:
             observations: result of `read`.
@@ -192,20 +204,30 @@ class SegmentCompletion:
             return dict(observations)
         shape = values.get(SHAPE, observations.get(SHAPE))
         frames, _ = self._at_moments(values[LATENT], shape, observations)
-        rotations, places = self.model.timed.poses(frames)
-        return {
-            **observations,
-            NEAREST: nearest_vertices(self.model.body, shape, rotations, places, observations[POINTS]),
-        }
+        pose = shape, *self.model.timed.poses(frames)
+        renewed = {**observations, NEAREST: nearest_vertices(self.model.body, *pose, observations[POINTS])}
+        if self.two_way:
+            renewed[NEAREST_POINTS] = _nearest_points(self._thin_surface(*pose), observations[POINTS])
+        return renewed
 
-    def _decode(self, z: Tensor, shape: Tensor, observations: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the times (B, K) of the moments, and the decoded counterparts of all observations by name."""
+    def _thin_surface(self, shape: Tensor, rotations: Tensor, places: Tensor) -> Tensor:
+        """Return every `THIN`-th vertex (B, K, V, 3)."""
+        vertices = torch.arange(0, len(self.model.body.template), THIN, device=shape.device)
+        return self.model.body.select_vertices(shape, rotations, places, vertices)  # type: ignore[no-any-return]
+
+    def _decode(
+        self, z: Tensor, shape: Tensor, observations: Mapping[str, Any], both: bool
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the times (B, K) of the moments, and the decoded counterparts of all observations by name.
+
+        With points, `both` adds vertices, to compare them with the nearest points.
+        """
         body = self.model.body
         frames, times = self._at_moments(z, shape, observations)
         rotations, places = self.model.timed.poses(frames)
         pose, decoded = (shape, rotations, places), {}
         if SURFACES in observations:
-            decoded[SURFACES] = body.select_vertices(*pose, torch.arange(0, len(body.template), THIN, device=z.device))
+            decoded[SURFACES] = self._thin_surface(*pose)
         if SPOTS in observations:
             decoded[SPOTS] = body.select_vertices(*pose, torch.tensor(self.markers, device=z.device))
         if POINTS in observations:
@@ -215,6 +237,8 @@ class SegmentCompletion:
                 else nearest_vertices(body, *pose, observations[POINTS])
             )
             decoded[POINTS] = body.select_vertices(*pose, vertices)
+            if both:
+                decoded[TO_POINTS] = self._thin_surface(*pose)
         return times, decoded
 
     def _at_moments(self, z: Tensor, shape: Tensor, observations: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
@@ -340,6 +364,7 @@ def complete(
     markers: Sequence[int] | None = None,
     known: Mapping[str, Any] | None = None,
     aggregate: bool = True,
+    two_way: bool = False,
     descent: Descent | None = None,
     seed: int = 0,
     chunk: int = 128,
@@ -350,7 +375,7 @@ def complete(
     Args:
         model: model of segments, as in `SegmentCompletion`.
         observations: values in the format of this module.
-        deviations, markers, known, aggregate: same as in `SegmentCompletion`.
+        deviations, markers, known, aggregate, two_way: same as in `SegmentCompletion`.
         descent, seed, chunk, progress: same as in `dvae.posterior`.
 
     Returns:
@@ -360,7 +385,7 @@ def complete(
         ValueError: same as `SegmentCompletion.read`.
     """
     spots = markers or tuple(MARKERS.values())
-    program = SegmentCompletion(model, deviations or Deviations(), spots, known, aggregate)
+    program = SegmentCompletion(model, deviations or Deviations(), spots, known, aggregate, two_way)
     data, guide = program.read(observations), None if known is None else program.guide
     options: dict[str, Any] = {"descent": descent, "seed": seed, "chunk": chunk, "progress": progress}
     with evaluating(model):
@@ -456,7 +481,8 @@ def sample_surfaces(vertices: Tensor, faces: Tensor, points: int, generator: tor
 def chamfer(points: Tensor, vertices: Tensor) -> Tensor:
     """Return the mean distance (...,) of points (..., M, 3) to the nearest of the vertices (..., V, 3), in metres.
 
-    The distance is one-sided, because few points do not cover the whole surface. NaN points are ignored.
+    The distance is one-sided, because few points do not cover the whole surface. NaN points are ignored. For the other
+    direction of a Chamfer distance, exchange the arguments, without NaN.
     """
     distances = torch.cdist(points.nan_to_num(0.0), vertices).amin(-1)
     return torch.where(points.isfinite().all(-1), distances, torch.nan).nanmean(-1)
@@ -514,6 +540,21 @@ def nearest_vertices(body: Body, shape: Tensor, rotations: Tensor, places: Tenso
             for flat, near in blocks:  # |p - v|^2 - |p|^2; the second term is constant
                 indices.append(torch.baddbmm(flat.square().sum(-1)[:, None], near, flat.mT, alpha=-2).argmin(-1))
     return torch.cat(indices).unflatten(0, points.shape[:2])  # type: ignore[no-any-return]
+
+
+def _nearest_points(vertices: Tensor, points: Tensor) -> Tensor:
+    """Return indices (B, K, V) of the observed points (B, K, M, 3) nearest to vertices (B, K, V, 3)."""
+    with torch.no_grad():
+        distances = torch.cdist(vertices, points.nan_to_num(0.0))
+        return distances.masked_fill(~points.isfinite().all(-1)[..., None, :], torch.inf).argmin(-1)
+
+
+def _near_points(vertices: Tensor, observations: Mapping[str, Any]) -> Tensor:
+    """Return the points (B, K, V, 3) nearest to vertices, NaN in frames without points."""
+    points = observations[POINTS]
+    nearest = observations[NEAREST_POINTS] if NEAREST_POINTS in observations else _nearest_points(vertices, points)
+    near: Tensor = points.gather(-2, nearest[..., None].expand(*nearest.shape, 3))
+    return near
 
 
 def _shrink(means: Tensor, variance: Tensor) -> Tensor:

@@ -36,7 +36,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ERROR, DURATION = "vertex error", "duration error"
-METRICS = {ERROR: Metric("mm"), DURATION: Metric("ms"), **TEACHER_FORCED}
+POSTERIOR = "KL", "latent norm", "latent deviation"
+"""Scores that compare the posterior of a segment with N(0, I): KL, norm of the mean, and mean standard deviation."""
+METRICS = {
+    **{ERROR: Metric("mm"), DURATION: Metric("ms"), **TEACHER_FORCED},
+    **{name: Metric("nats" if name == "KL" else "", "teacher-forced", "") for name in POSTERIOR},
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -208,7 +213,8 @@ def reconstruct_segments(
         progress: whether to show a progress bar.
 
     Returns:
-        Vertex errors in mm, duration errors in ms, and bounds in nats per frame, of each segment by model.
+        Vertex errors in mm, duration errors in ms, and bounds in nats per frame, of each segment by model; also the KL
+        of its posterior from N(0, I) in nats, the norm of the posterior mean, and the mean posterior deviation.
 
     Raises:
         ValueError: `models` is empty, or a batch size or number of particles is invalid.
@@ -275,6 +281,9 @@ def _scores(model: Any, segments: Segments, particles: int, batch: Mapping[str, 
     scores = _errors(segments, model.decode(model.encode(data), data[SHAPE]).cpu(), batch)
     terms = SequenceELBO().terms(model, data)
     scores["ELBO"] = terms.per_step
+    posterior = model.posterior(data)
+    values = terms.kl["z"], posterior.mean.norm(dim=-1), posterior.stddev.mean(-1)
+    scores |= dict(zip(POSTERIOR, values, strict=True))
     if particles:
         bound = iwae_bound(model, data, particles=particles)
         scores |= {"IWAE bound": bound.bound / terms.n_steps, "k-hat": bound.khat}
@@ -294,7 +303,7 @@ def _errors(segments: Segments, x: Tensor, batch: Mapping[str, Any]) -> dict[str
 
 
 def _cell(score: Score, metric: Metric) -> str:
-    decimals = 1 if metric.unit in ("mm", "ms") else 3
+    decimals = 1 if metric.unit in ("mm", "ms", "nats") else 3
     low, high = score.interval()
     interval = "" if math.isnan(low) or metric.unit == "" else f" [{low:.{decimals}f}, {high:.{decimals}f}]"
     return f"{score.mean:.{decimals}f}{interval}"

@@ -30,6 +30,7 @@ from .completion import (
     SPOTS,
     SURFACES,
     TIMES,
+    TO_POINTS,
     Completed,
     Deviations,
     SegmentCompletion,
@@ -100,6 +101,8 @@ class Recovered:
         timed, draws = self.completed.model.timed, len(self.draws[0])
         measures = {"duration\ns": timed.lasts, "displacement\nm": timed.travels}
         errors = {f"from\n{name}\nmm": value for name, value in self.distances.items()}
+        if TO_POINTS in self.distances:
+            errors["surface to\npoints\nmm"] = errors.pop(f"from\n{TO_POINTS}\nmm")
         titles = {"vertex error": "vertex\nerror\nmm", "duration error": "duration\nerror\nms"}
         errors |= {titles[name]: value for name, value in self.errors.items()}
         caption = f"[ ]: {100 * LEVEL:g} % of {draws} draws; too narrow if errors are correlated or exceed deviations"
@@ -162,6 +165,7 @@ def recover(
     deviations: Deviations | None = None,
     known: Mapping[str, Any] | None = None,
     aggregate: bool = True,
+    two_way: bool = False,
     descent: Descent | None = None,
     seed: int = 0,
     progress: bool = False,
@@ -169,7 +173,7 @@ def recover(
     """Complete segments, and evaluate the results.
 
     Args:
-        model, observations, deviations, known, aggregate, descent, seed, progress: same as in `complete`.
+        model, observations, deviations, known, aggregate, two_way, descent, seed, progress: same as in `complete`.
         keys: (split, name) of each segment.
         truth: true x (B, N, D) and beta (B, S), if known.
 
@@ -182,6 +186,7 @@ def recover(
     """
     _check_nonempty(SegmentCompletion(model).read(observations))
     options: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
+    options["two_way"] = two_way
     completed = complete(model, observations, **options, seed=seed, progress=progress)
     bound = completed.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
     distances = completed.program.distances(completed.observations, completed.posterior.mode[LATENT], completed.shape)

@@ -50,6 +50,9 @@ class Linear(torch.nn.Module):
         losses = [s * ((self.shared @ self.x - y) ** 2).sum() for s, y in zip(self.scales, self.y)]
         return energies(**dict(zip(self.names, losses)))
 
+    def terms_tensor(self):
+        return torch.stack(list(self.terms().energies.values())).flatten() / 2
+
     def losses(self):
         return torch.stack(list(self.terms().energies.values())).flatten().detach() / 2
 
@@ -111,6 +114,55 @@ def test_a_step_descends_the_loss_of_the_paper(asymmetry):
         torch.testing.assert_close(balance.task_weights, expected, rtol=1e-7, atol=0)
         with torch.no_grad():  # tasks train at different rates
             model.shared += 0.05 * torch.outer(model.y[0] - model.shared @ model.x, model.x)
+
+
+@pytest.mark.parametrize("asymmetry", [0.12, 1.5])
+def test_the_published_update_is_the_algorithm_of_the_paper(asymmetry):
+    """Compare with a few lines of algorithm 1 by automatic differentiation, on squared errors of unequal scale."""
+    model = Linear(scales=(1.0, 2.0, 0.5))
+    objective = GradNorm(model.names, "shared", asymmetry=asymmetry, learning_rate=0.002, update="published")
+    balance, w, first = objective.begin(model), torch.ones(3).double(), model.losses()
+    for step in range(60):
+        w.requires_grad_()
+        losses = model.terms_tensor()
+        norms = torch.stack(
+            [torch.autograd.grad(w[i] * losses[i], model.shared, create_graph=True)[0].norm() for i in range(3)]
+        )
+        ratios = losses.detach() / first
+        target = (norms.mean() * (ratios / ratios.mean()) ** asymmetry).detach()
+        (gradient,) = torch.autograd.grad((norms - target).abs().sum(), w)
+        w = w.detach() - 0.002 * gradient
+        w = w * 3 / w.sum()
+        balance.adapt(balance.measure(model.terms()), single_process_mean)
+        torch.testing.assert_close(balance.task_weights, w, rtol=1e-10, atol=0)
+        (step_direction,) = torch.autograd.grad((w * model.terms_tensor()).sum(), model.shared)
+        with torch.no_grad():  # a step of the network with these weights
+            model.shared -= 0.02 * step_direction
+    assert (w - 1).abs().max() > 0.1
+
+
+def test_a_negative_weight_of_the_published_update_is_an_error():
+    model = Linear()
+    balance = GradNorm(model.names, "shared", learning_rate=1.0, update="published").begin(model)
+    with pytest.raises(ValueError, match="published update makes the weight of task1 -"):
+        balance.adapt(balance.measure(model.terms()), single_process_mean)
+
+
+def test_training_rates_are_of_losses_above_their_minimum():
+    """With their constants, log densities and squared errors have the same weights."""
+    model, constants = Linear(scales=(1.0, 2.0, 0.5)), {"task0": -3.0, "task2": 5.0}
+    shifted = GradNorm(model.names, "shared", asymmetry=1.5, lowest=constants).begin(model)
+    plain = GradNorm(model.names, "shared", asymmetry=1.5).begin(model)
+    for _ in range(5):
+        terms = model.terms()
+        with_constants = {name: value + 2 * constants.get(name, 0.0) for name, value in terms.energies.items()}
+        plain.adapt(plain.measure(terms), single_process_mean)
+        shifted.adapt(shifted.measure(energies(**with_constants)), single_process_mean)
+        torch.testing.assert_close(shifted.task_weights, plain.task_weights)
+        with torch.no_grad():
+            model.shared += 0.05 * torch.outer(model.y[0] - model.shared @ model.x, model.x)
+    with pytest.raises(ValueError, match="`lowest` includes 'z', but the tasks are task0"):
+        GradNorm(model.names, "shared", lowest={"z": 1.0})
 
 
 @given(st.data())

@@ -22,7 +22,7 @@ RUNS = {
     "staged": {
         "stages": [
             Stage(10, WARM_UP, frozen=("generator.z.",)),
-            Stage(14, learning_rate=0.01, scheduled_sampling=Piecewise(((10, 0.0), (21, 0.5)))),
+            Stage(14, learning_rate=0.01, scheduled_sampling=Piecewise(((10, 0.0), (21, 0.5))), batch_size=3),
         ],
         "optimizer": "adamw",
         "weight_decay": 0.01,
@@ -34,7 +34,7 @@ def by_hand(loop, until=STEPS):
     """Take steps up to `until`, with validations, while the caller draws random numbers; return the rows of the log."""
     source, rows = Sequences({"x": TRAIN}), []
     while loop.state.step < until:
-        loop.step(source.sample(8, loop.generator))
+        loop.step(source.sample(loop.batch_size, loop.generator))
         rows.append({"step": loop.state.step, **loop.row()})
         torch.rand(3)
         loop.model.eval()
@@ -59,6 +59,21 @@ def test_steps_by_hand_repeat_a_fit_and_resume_bit_for_bit(tmp_path, options):
         assert (loop.state.best_step, loop.state.best_bound) == (result.best_step, result.best_bound)
         assert same(loop.state.best, weights(fit_model))
     assert same(weights(resumed.model), weights(uninterrupted.model))
+
+
+def test_a_stage_has_its_own_batch_size():
+    sizes = []
+
+    class Counted(Sequences):
+        def sample(self, batch_size, generator):
+            sizes.append(batch_size)
+            return super().sample(batch_size, generator)
+
+    stages = [Stage(2), Stage(3, batch_size=5), Stage(1)]
+    dvae.fit(build(), Counted({"x": TRAIN}), stages=stages, **SHARED)
+    assert sizes == [8, 8, 5, 5, 5, 8]
+    with pytest.raises(ValueError, match="batch_size of a stage must be at least 1, got 0"):
+        Stage(1, batch_size=0)
 
 
 def test_the_random_state_of_the_caller_is_unchanged():

@@ -1,5 +1,7 @@
 """The latent space of 4D motion: its two guides, its energy of surfaces and its two phases."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -51,6 +53,32 @@ def test_the_energy_is_the_mean_squared_distance_of_vertices(segments):
     expected = differences.square().sum(-1).mean(-1).sum(-1) / (2 * 0.05**2)
     torch.testing.assert_close(terms.energies[SURFACE], expected, rtol=1e-4, atol=1e-4)
     assert not dvae.SequenceELBO().terms(model, batch).energies  # computed only on request
+
+
+def test_published_training_is_of_squared_errors_in_the_phases_of_the_paper(segments):
+    """5,000 epochs in batches of 256 at 1e-3, then 200 in batches of 16 at 1e-4, for 13,121 segments."""
+    method = replace(SMALL, published=True)
+    training = method.training(segments)
+    assert (training.steps, training.batch_size, training.learning_rate) == (5000 * 52 + 200 * 821, 256, 1e-3)
+    first, second = method.train(segments, steps=training.steps).stages
+    assert (first.steps, first.batch_size, first.learning_rate) == (5000 * 52, None, None)
+    assert (second.steps, second.batch_size, second.learning_rate) == (200 * 821, 16, 1e-4)
+    assert {stage.objective.asymmetry for stage in (first, second)} == {0.12}
+    model, batch = build(segments, method).double(), {n: v.double() for n, v in segments.all().items()}
+    torch.manual_seed(0)
+    terms = dvae.SequenceELBO().terms(model, batch, draws={"z": 1})
+    torch.manual_seed(0)
+    x = model.reconstruct(batch)["x"][0]
+    frames, places = len(batch["x"]) * 100, model.timed.parts
+    squares = {name: (x - batch["x"])[..., columns].square().sum() / frames for name, columns in places.items()}
+    distances = (model.vertices(x, batch[SHAPE]) - model.vertices(batch["x"], batch[SHAPE])).square().sum(-1).mean(-1)
+    squares[SURFACE] = 6890 * distances.sum() / frames
+    for stage in (first, second):
+        for task, loss in zip(stage.objective.tasks, stage.objective.losses(terms), strict=True):
+            torch.testing.assert_close(loss, squares[task], rtol=1e-5, atol=1e-7)
+    loss = sum(squares[task] for task in second.objective.tasks) + 0.01 * terms.kl["z"].sum() / frames
+    torch.testing.assert_close(second.objective(terms, 0), loss, rtol=1e-5, atol=1e-7)
+    assert replace(method, finish=0.0).train(segments, steps=10).stages[-1].steps == 10  # given options are kept
 
 
 def test_training_has_two_phases_of_adaptive_weights(segments, tmp_path):

@@ -9,6 +9,8 @@ from dvae import motion
 from dvae.models.motion.motion_latent import MotionLatent
 from dvae.motion import bodies
 from dvae.motion.segments.completion import (
+    THIN,
+    TO_POINTS,
     Deviations,
     SegmentCompletion,
     _at_moments,
@@ -159,20 +161,42 @@ def test_missing_observations_change_nothing(model):
     assert energy(late) < energy(timed)
 
 
-def test_points_are_compared_with_the_nearest_vertices(model):
+@pytest.mark.parametrize("two_way", [False, True])
+def test_points_are_compared_with_the_nearest_vertices(model, two_way):
     _, shape, x = draw_segments(model, 2)
     rotations, places = model.timed.poses(x[:, ::30])
     vertices = model.body(shape, rotations, places)[0]
     points = vertices[:, :, ::100] + 0.01 * torch.randn(2, 4, 15, 3, dtype=torch.float64)
     nearest = nearest_vertices(model.body, shape, rotations, places, points)
     assert torch.equal(nearest, torch.cdist(points, vertices).argmin(-1))
-    program, (z, shape, x) = SegmentCompletion(model), draw_segments(model, 2)
+    program, (z, shape, x) = SegmentCompletion(model, two_way=two_way), draw_segments(model, 2)
     observed = program.read(simulate_observations(model, x, shape, "points", frames=[0, 50]))
     values = {"z": z, SHAPE: shape}
     runs = [poutine.trace(poutine.condition(program, values)) for _ in range(2)]
     batches = observed, program.renewed(observed, values)
     computed, given_nearest = (run.get_trace(batch).log_prob_sum() for run, batch in zip(runs, batches, strict=True))
     torch.testing.assert_close(computed, given_nearest)
+
+
+def test_a_two_way_error_adds_the_distances_of_vertices_from_their_nearest_points(model):
+    """All vertices of a frame weigh as much as its points; missing points are never the nearest."""
+    z, shape, x = draw_segments(model, 2)
+    observed = simulate_observations(model, x, shape, "points", frames=[0, 50], points=20)
+    observed["points"][:, :, 4:8] = torch.nan
+    observed["points"][1, 1] = torch.nan  # an empty frame has no error
+    programs = [SegmentCompletion(model, two_way=two_way) for two_way in (False, True)]
+    values = {"z": z, SHAPE: shape}
+    batch = programs[0].read(observed)
+    one, both = (poutine.trace(poutine.condition(each, values)).get_trace(batch) for each in programs)
+    vertices = model.body(shape, *model.timed.poses(x[:, [0, 50]]))[0][:, :, ::THIN]
+    frames = [(vertices[b, k], observed["points"][b, k]) for b, k in ((0, 0), (0, 1), (1, 0))]
+    nearest = torch.stack([torch.cdist(v, p[p.isfinite().all(-1)]).amin(-1) for v, p in frames])
+    deviation = 0.1 * (vertices.shape[2] / 20) ** 0.5
+    normal = torch.distributions.Normal(torch.zeros((), dtype=torch.float64), deviation)
+    expected = normal.log_prob(nearest).sum() + 2 * nearest.numel() * normal.log_prob(normal.mean)
+    torch.testing.assert_close(both.log_prob_sum() - one.log_prob_sum(), expected)
+    distances = programs[0].distances(batch, z, shape)
+    torch.testing.assert_close(distances[TO_POINTS], torch.stack([nearest[:2].mean(), nearest[2].mean()]))
 
 
 def test_known_segments_determine_the_prior(model, segments):

@@ -11,6 +11,7 @@ from dvae.motion.segments.embodied import SHAPE, Segments
 from dvae.motion.segments.reconstruction import (
     DURATION,
     ERROR,
+    POSTERIOR,
     PrincipalComponents,
     Reconstruction,
     reconstruct_segments,
@@ -71,7 +72,7 @@ def test_models_are_compared_with_components_of_their_size(segments, model):
     result = reconstruct_segments(models, test, train, bound_particles=2, progress=False)
     assert list(result.rows) == ["a", "PCA of 11", "b", "coarse", "PCA of 11, frames of coarse"]
     for name in ("a", "coarse"):
-        assert {*result.rows[name]} == {ERROR, DURATION, "ELBO", "IWAE bound", "k-hat"}
+        assert {*result.rows[name]} == {ERROR, DURATION, "ELBO", "IWAE bound", "k-hat", *POSTERIOR}
     for name, values in result.rows["a"].items():
         np.testing.assert_array_equal(values, result.rows["b"][name])  # every model draws from the same seed
     assert result.difference("a", "b").mean == 0
