@@ -22,7 +22,7 @@ from dvae.data import Batch
 from dvae.data.batch import WHOLE
 from dvae.motion.segments.dataset import SegmentData
 from dvae.motion.segments.embodied import SHAPE, Segments
-from dvae.motion.segments.generation import REAL, Generated, aggregate_posterior, generate, priors, summarise
+from dvae.motion.segments.generation import KNOWN, REAL, Generated, aggregate_posterior, generate, priors, summarise
 from dvae.motion.segments.interpolation import falls, interpolate
 from dvae.motion.segments.reconstruction import reconstruct_segments
 
@@ -84,7 +84,7 @@ def drawn(model: Any, test: Segments, training: Segments, seed: int) -> dict[str
     bodies = real.shape[np.random.default_rng(seed).integers(len(test), size=DRAWN)]
     latents = priors(model, training.all())
     rows = {name: generate(model, bodies, prior=prior, seed=seed) for name, prior in latents.items()}
-    return summarise({**rows, REAL: real}, known)
+    return summarise({**rows, KNOWN: known, REAL: real}, known)
 
 
 def interpolated(model: Any, test: Segments, seed: int) -> dict[str, Any]:
@@ -173,10 +173,10 @@ def prior_table(cases: Mapping[str, Row]) -> Table:
         runs = [run for run in row.runs if "generated" in run] if row.name == OURS else []
         for prior in runs[0]["generated"] if runs else ():
             rows[f"{case}, {prior}"] = [{**run["generated"][prior], **run["posterior"]} for run in runs]
-        if runs:
-            del rows[f"{case}, {REAL}"]
-            rows[REAL] = [runs[0]["generated"][REAL]]
-    rows[REAL] = rows.pop(REAL)  # the last row
+        for name in (KNOWN, REAL) if runs else ():
+            del rows[f"{case}, {name}"]
+            rows[name] = [runs[0]["generated"][name]]
+    rows |= {name: rows.pop(name) for name in (KNOWN, REAL)}  # the last rows
     names = dict.fromkeys(name for each in rows.values() for name in each[0])
     columns = {name: lambda each, name=name: spread([run.get(name) for run in each]) for name in names}
     return tabled(rows, columns)

@@ -21,6 +21,7 @@ from ..motion.segments.dataset import subsample_clips
 from ..motion.segments.embodied import SHAPE
 from ..motion.segments.frames import resting_offsets
 from ..motion.segments.generation import (
+    KNOWN,
     REAL,
     STANDARD,
     Generated,
@@ -194,7 +195,7 @@ def generate(
     """Draw segments of motion from N(0, I), the prior of a run of motion-latent, and compare them with real ones.
 
     Prints means of statistics, such as speed, contact and sliding of the feet, for segments from the prior, from two
-    distributions of the latents of training segments, and for real test segments. Also prints how far these latents are
+    distributions of the latents of training segments, and for real segments. Also prints how far these latents are
     from N(0, I); if they are far, raise --kl of the fit.
 
     Args:
@@ -224,7 +225,7 @@ def generate(
     options: dict[str, Any] = {"seconds": seconds, "tolerance": tolerance, "seed": seed}
     latents_by_name = priors(model, parts["known"])
     rows = {name: generate_segments(model, bodies, **options, prior=prior) for name, prior in latents_by_name.items()}
-    rows[REAL] = real["real"]
+    rows |= {KNOWN: real["known"], REAL: real["real"]}
     if out is not None:
         _write_generated(out, rows[STANDARD], real["real"], shown)
     OUT.print(summary_table(summarise(rows, real["known"])))

@@ -304,9 +304,9 @@ def test_motion_latent(tmp_path, out, monkeypatch):
     assert other[1][1] != same[1][1]
     main(**data, sections=("prior",), cases=("KL 1",), seeds=(0,), **options)
     (generated,) = tables(out, "motion_latent_4d/prior-generated")
-    names = ["KL 1, N(0, I)", "KL 1, fitted normal", "KL 1, aggregate posterior", "real"]
-    assert [row[0] for row in generated[1:]] == names
-    assert [row[-1] == "–" for row in generated[1:]] == [False, False, False, True]  # only models have latents
+    names = ["KL 1, N(0, I)", "KL 1, fitted normal", "KL 1, aggregate posterior"]
+    assert [row[0] for row in generated[1:]] == [*names, "real, training", "real, test"]
+    assert [row[-1] == "–" for row in generated[1:]] == [False] * 3 + [True] * 2  # only models have latents
 
 
 def test_completion(tmp_path, out, short, monkeypatch):

@@ -204,7 +204,8 @@ class SegmentCompletion:
             return dict(observations)
         shape = values.get(SHAPE, observations.get(SHAPE))
         frames, _ = self._at_moments(values[LATENT], shape, observations)
-        pose = shape, *self.model.timed.poses(frames)
+        rotations, places = self.model.timed.poses(frames)
+        pose = shape, rotations, places
         renewed = {**observations, NEAREST: nearest_vertices(self.model.body, *pose, observations[POINTS])}
         if self.two_way:
             renewed[NEAREST_POINTS] = _nearest_points(self._thin_surface(*pose), observations[POINTS])

@@ -37,8 +37,10 @@ MOMENTS = 30
 ROUNDS = 200
 """Maximum number of draws of z for each segment with a given duration."""
 APD, PLAUSIBLE = "APD (m)", "plausible (%)"
-STANDARD, FITTED, AGGREGATE, REAL = "N(0, I)", "fitted normal", "aggregate posterior", "real"
-"""Names of distributions of z, and of real segments."""
+STANDARD, FITTED, AGGREGATE = "N(0, I)", "fitted normal", "aggregate posterior"
+"""Names of distributions of z."""
+KNOWN, REAL = "real, training", "real, test"
+"""Names of real segments."""
 
 
 @dataclass(frozen=True, eq=False)
