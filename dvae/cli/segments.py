@@ -36,7 +36,7 @@ from ..motion.segments.recovery import recover as recover_segments
 from ..options import Positive, Range, check
 from ..runs import directory as runs
 from . import loading
-from .console import ERROR, OUT, Failed, UsageError, at_least, check_files, note
+from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, note
 from .help import Expert
 
 MOST_DRAWS = 100
@@ -190,6 +190,7 @@ def generate(
     shown: Annotated[int, Range(1, MOST_DRAWS)] = 5,
     seed: int = 0,
     data: str | None = None,
+    missing: Expert[Missing] = False,
     failed: Expert[Failed] = False,
 ) -> None:
     """Draw segments of motion from N(0, I), the prior of a run of motion-latent, and compare them with real ones.
@@ -212,7 +213,7 @@ def generate(
     at_least(2, samples=samples)
     check_files(out, None, ".npz", ".html", ".htm", "")
     loaded = loading.load_run(run, data, ("segments",), failed)
-    model, data_set = loaded.model, loading.data_of(data, loaded)
+    model, data_set = loaded.model, loading.data_of(data, loaded, missing=missing)
     known, test = data_set.windows("train"), data_set.windows("test")
     parts = {"known": known.all(), "real": test.all()}
     if beta is not None:

@@ -51,14 +51,6 @@ PRESETS = table(
 )
 """Options by skeleton: the paper's values; for other skeletons, values that train in minutes on a CPU."""
 
-LEARNED = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)", "q(z_t | r_{1:T}, s)"
-EQUATIONS = {
-    "learned": LEARNED,
-    "base": ("p(z_t) p(x_t | z_{1:T}, s)", "q(z_t | y_{1:T}, s)"),
-    "standard": ("p(z_t) p(x_t | z_{1:T}, y_{1:T}, s)", LEARNED[1]),
-}
-"""Generative and inference factorization by prior."""
-
 
 @dataclass(frozen=True)
 class TrajeVAE(LatentTrajectoryMethod):
@@ -79,7 +71,8 @@ class TrajeVAE(LatentTrajectoryMethod):
 
     name = "trajevae"
     source = "Kania, Kowalski and Trzcinski, 2021, arXiv 2104.00351"
-    generative, inference = LEARNED
+    generative = "p(z_t | y_{1:T}, s) p(x_t | z_{1:T}, s)"
+    inference = "q(z_t | r_{1:T}, s)"
 
     presets = PRESETS
 
@@ -111,7 +104,11 @@ class TrajeVAE(LatentTrajectoryMethod):
 
     @override
     def equations(self) -> tuple[Factorization, Factorization]:
-        p, q = EQUATIONS[self.prior]
+        p, q = {
+            "learned": (self.generative, self.inference),
+            "base": ("p(z_t) p(x_t | z_{1:T}, s)", "q(z_t | y_{1:T}, s)"),
+            "standard": ("p(z_t) p(x_t | z_{1:T}, y_{1:T}, s)", self.inference),
+        }[self.prior]
         masks = {}
         if self.components:
             p = p.replace("z_{1:T}", "z_{1:C}")
