@@ -6,7 +6,7 @@ and two processes may work on other cases or seeds at once. Tables show the avai
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -178,8 +178,12 @@ def prior_table(cases: Mapping[str, Row]) -> Table:
             rows[name] = [runs[0]["generated"][name]]
     rows |= {name: rows.pop(name) for name in (KNOWN, REAL)}  # the last rows
     names = dict.fromkeys(name for each in rows.values() for name in each[0])
-    columns = {name: lambda each, name=name: spread([run.get(name) for run in each]) for name in names}
-    return tabled(rows, columns)
+
+    def cell(each: Sequence[Mapping[str, float]], name: str) -> str:
+        values = [run.get(name) for run in each]
+        return f"{values[0]:.2f}" if len(values) == 1 and values[0] is not None else spread(values)
+
+    return tabled(rows, {name: partial(cell, name=name) for name in names})
 
 
 def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
