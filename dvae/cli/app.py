@@ -156,12 +156,12 @@ def _run(arguments: list[str]) -> None:
     name, function = named(arguments), command(arguments)
     if function is not None and name is not None:
         remaining = arguments[len(name.split()) :]
-        config: tuple[Any, ...] = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes)
+        config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
         if HELP & {*remaining}:
             from .help import command_stub
 
             function, method = command_stub(function, remaining, everything="--help-all" in remaining)
-            name, remaining, config = name + method, ["--help"], (*config, tyro.conf.DisallowNone)
+            name, remaining = name + method, ["--help"]
         tyro.cli(function, prog=f"dvae {name}", args=remaining, config=config)
     elif arguments == ["--version"]:
         OUT.print(f"dvae {__version__}")

@@ -222,6 +222,15 @@ def generate(
         shapes = {name: torch.tensor(beta).expand(len(part[SHAPE]), -1) for name, part in parts.items()}
         parts = {name: test.on_bodies(part, shapes[name]) for name, part in parts.items()}
     real = {name: Generated(model, part[WHOLE], part[SHAPE]) for name, part in parts.items()}
+    if seconds is not None:
+        for name, each in real.items():
+            last = (model.timed.lasts(each.x) - seconds).abs() <= tolerance
+            if (count := int(last.sum())) < 2:
+                raise UsageError(
+                    f"only {count} of {len(last)} real segments last {seconds:g} ± {tolerance:g} s; generated segments are "
+                    "compared with real ones, so choose another duration, or a larger --tolerance"
+                )
+            real[name] = replace(each, x=each.x[last], shape=each.shape[last])
     bodies = parts["real"][SHAPE].repeat(-(-samples // len(test)), 1)[:samples]
     options: dict[str, Any] = {"seconds": seconds, "tolerance": tolerance, "seed": seed}
     latents_by_name = priors(model, parts["known"])

@@ -21,8 +21,8 @@ The paper does not give, and we choose:
 * The reduction of the squared errors, to which the KL is relative. Averages would be so small, next to the KL, that the
   latent would carry nothing, so we read sums.
 * The asymmetry of GradNorm, here 0.12 as in its own paper, the learning rate of the weights, and the layer whose
-  gradients they balance, here the last one that all tasks share. We call the KL squared where the paper does; it is the
-  usual KL.
+  gradients they balance, here the last one that all tasks share. The paper calls its term the squared KL
+  divergence; we use the KL. Weights change by our update of `dvae.GradNorm`, in log w.
 
 Without `published`, training suits short runs (benchmarks/results/motion_latent_4d): normal likelihoods, whose scales
 replace the reduction; weights that equalise gradients (asymmetry 0); and one batch size for both phases.

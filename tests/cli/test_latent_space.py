@@ -255,4 +255,4 @@ def test_segments_are_generated_from_the_prior(capsys, folder, tmp_path):
     assert main(["generate", run, *fixed, "--out", str(tmp_path / "a.npz")]) == 0
     assert [clip.name for clip in motion.read_motion(tmp_path / "a.npz")] == [f"sample-0{n}" for n in range(3)]
     assert "--beta has 1 numbers, expected 8" in failure(capsys, "generate", run, "--beta", "1", code=2)
-    assert "draws from the prior last 9 ± 0.05 s" in failure(capsys, "generate", run, "--seconds", "9")
+    assert "real segments last 9 ± 0.05 s" in failure(capsys, "generate", run, "--seconds", "9", code=2)

@@ -34,7 +34,7 @@ CENTRAL = 0.99
 """Probability of the central interval of real segments in which each statistic of a plausible segment lies."""
 MOMENTS = 30
 """Number of evenly spaced times of a segment at which statistics are computed."""
-ROUNDS = 200
+MOST_PROPOSALS = 200
 """Maximum number of draws of z for each segment with a given duration."""
 APD, PLAUSIBLE = "APD (m)", "plausible (%)"
 STANDARD, FITTED, AGGREGATE = "N(0, I)", "fitted normal", "aggregate posterior"
@@ -215,18 +215,16 @@ def generate(
         standard = torch.distributions.Normal(shape.new_zeros(model.sizes["z"]), 1.0)
         prior = prior or torch.distributions.Independent(standard, 1)
         x = model.decode(prior.sample((len(shape),)), shape)
-        for _ in range(ROUNDS if seconds is not None else 0):
-            rejected = (model.timed.lasts(x) - seconds).abs() > tolerance
-            if not rejected.any():
-                break
-            x[rejected] = model.decode(prior.sample((int(rejected.sum()),)), shape[rejected])
-        else:
-            if seconds is not None:
-                low, high = model.timed.lasts(x).aminmax()
+        drawn, (low, high) = len(x), model.timed.lasts(x).aminmax()
+        while seconds is not None and (rejected := (model.timed.lasts(x) - seconds).abs() > tolerance).any():
+            count = int(rejected.sum())
+            if drawn >= MOST_PROPOSALS * len(x):
                 raise ValueError(
-                    f"fewer than 1 in {ROUNDS} draws from the prior last {seconds:g} ± {tolerance:g} s; the last draws "
-                    f"take {low:.2f} to {high:.2f} s; choose such a duration, or a larger tolerance"
+                    f"only {len(x) - count} of {drawn} draws from the prior last {seconds:g} ± {tolerance:g} s; the first "
+                    f"{len(x)} take {low:.2f} to {high:.2f} s; choose such a duration, or a larger tolerance"
                 )
+            x[rejected] = model.decode(prior.sample((count,)), shape[rejected])
+            drawn += count
     return Generated(model, x.cpu(), shape.cpu())
 
 
