@@ -227,8 +227,8 @@ def generate(
             last = (model.timed.lasts(each.x) - seconds).abs() <= tolerance
             if (count := int(last.sum())) < 2:
                 raise UsageError(
-                    f"only {count} of {len(last)} real segments last {seconds:g} ± {tolerance:g} s; generated segments are "
-                    "compared with real ones, so choose another duration, or a larger --tolerance"
+                    f"only {count} of {len(last)} real segments last {seconds:g} ± {tolerance:g} s, with which "
+                    "generated ones are compared; choose another duration, or a larger --tolerance"
                 )
             real[name] = replace(each, x=each.x[last], shape=each.shape[last])
     bodies = parts["real"][SHAPE].repeat(-(-samples // len(test)), 1)[:samples]

@@ -220,8 +220,8 @@ def generate(
             count = int(rejected.sum())
             if drawn >= MOST_PROPOSALS * len(x):
                 raise ValueError(
-                    f"only {len(x) - count} of {drawn} draws from the prior last {seconds:g} ± {tolerance:g} s; the first "
-                    f"{len(x)} take {low:.2f} to {high:.2f} s; choose such a duration, or a larger tolerance"
+                    f"only {len(x) - count} of {drawn} draws from the prior last {seconds:g} ± {tolerance:g} s; the "
+                    f"first {len(x)} take {low:.2f} to {high:.2f} s; choose such a duration, or a larger tolerance"
                 )
             x[rejected] = model.decode(prior.sample((count,)), shape[rejected])
             drawn += count
