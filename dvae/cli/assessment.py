@@ -136,7 +136,7 @@ def evaluate(
         run: run directories, fitted on the same data under the same protocol.
         control: joints whose true paths are given to methods that take trajectories.
         angles: options of --measure angles.
-        realism: options of --measure quality.
+        realism: options of --measure quality, whose defaults take hours on a CPU.
         data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
         measure: scores of forecasts; or, for motion, their quality (how hard they are to distinguish from real motion),
             errors of their Euler angles (best of 1 and of K), or the diversity of the codes of mix-and-match.

@@ -163,8 +163,9 @@ def _follow_paths(
     with seeded(seed):
         completion = run.model.complete(pose, path_by_joint, None if path_by_joint else len(truth), samples, **options)
     before_and_after = pose[None, None], truth[None, : completion.positions.shape[1]]
+    emission = "drawn" if run.model.is_drawn() else "mean"
     motions = motion.Forecasts(
-        windows.skeleton, [windows.keys[index]], completion.positions[:, None], *before_and_after, "mean"
+        windows.skeleton, [windows.keys[index]], completion.positions[:, None], *before_and_after, emission
     )
     motions.save(out)
     ERROR.print(f"wrote {out}: window {index}, {_title(motions)}")

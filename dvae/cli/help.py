@@ -53,6 +53,7 @@ def command_stub(
             continue
         elif is_dataclass(hint):
             hint = _copy_options(hint, everything, defaults)
+            parameter = parameter.replace(default=inspect.Parameter.empty)  # the copy has the same defaults
         else:
             hint = _with_default(hint, parameter.default)
         parameters.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))

@@ -52,14 +52,14 @@ def codes(model: Any, batch: AnyBatch, samples: int = 50) -> Tensor:
         Codes (K, B, L).
 
     Raises:
-        TypeError: if the model has no such network.
+        ValueError: if the model has no such network.
     """
-    network = model.generator[WHOLE].network
+    network = model.generator[WHOLE].network if WHOLE in model.generator else None
     entrance = getattr(network, "entrance", None)
     if not isinstance(entrance, nn.Module):
-        raise TypeError(
-            f"codes need a decoder with an `entrance`, the module through which noise enters; {type(network).__name__} "
-            "has none"
+        raise ValueError(
+            "codes need a decoder with an `entrance`, the module through which noise enters, as mix-and-match has; "
+            + (f"{type(network).__name__} has none" if network is not None else "this model has no single decoder of x")
         )
     outputs: list[Tensor] = []
     hook = entrance.register_forward_hook(lambda module, inputs, output: outputs.append(output))
@@ -139,7 +139,7 @@ def code_scores(
 
     Raises:
         ValueError: there are fewer than two observations or samples.
-        TypeError: a model has no codes.
+        ValueError: a model has no codes.
     """
     if len(batch[WHOLE]) < 2:
         raise ValueError(f"the diversity of codes needs at least two observations, got {len(batch[WHOLE])}")

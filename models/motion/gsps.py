@@ -194,6 +194,11 @@ class GSPS(EnergyMethod):
                     f"skeleton {skeleton!r}; give a number, or a bandwidth in Hz"
                 )
             return PUBLISHED[count][skeleton]
+        if bandwidth is not None and bandwidth > schema.protocol.fps / 2:
+            raise ValueError(
+                f"bandwidth is {bandwidth:g} Hz, but {schema.protocol.fps:g} frames per second contain frequencies "
+                f"up to {schema.protocol.fps / 2:g} Hz; give a lower one"
+            )
         if count is None and bandwidth is None:
             count = self.preset(schema.skeleton)["coefficients"]
         return count or coefficients_up_to(bandwidth or BANDWIDTH, schema.frames, schema.protocol.fps)

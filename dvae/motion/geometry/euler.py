@@ -113,7 +113,7 @@ class Angles:
         if not inverse and protocol.representation == "positions":
             raise ValueError(
                 f"windows of {protocol.name} have positions, which do not determine all rotations; use a protocol "
-                "whose representation is a rotation, or inverse=True to compute rotations from positions"
+                "whose representation is a rotation, or inverse=True (`--inverse`) to compute rotations from positions"
             )
         self.windows = windows
         self.protocol = AngleProtocol(protocol.name, protocol.fps, tuple(times), frames, inverse)
@@ -198,8 +198,8 @@ class AngleModel(nn.Module):
         self.rotations = next((view_of_part for view_of_part in views if isinstance(view_of_part, Rotations)), None)
         if self.rotations is None and not angles.protocol.inverse:
             raise ValueError(
-                "a model of positions predicts no rotations; score it with inverse=True, which estimates them from "
-                "positions, for all models that are compared"
+                "a model of positions predicts no rotations; score it with inverse=True (`--inverse`), which estimates "
+                "them from positions, for all models that are compared"
             )
 
     def is_drawn(self, means: bool = False) -> bool:

@@ -82,7 +82,7 @@ def test_the_model_has_the_published_number_of_parameters(skeleton, observed, le
         ("humaneva", motion.HUMANEVA, {"bandwidth": 2.8}, 8),
         ("simulated", motion.WALKER, {}, 15),
         ("simulated", motion.WALKER, {"bandwidth": 1.4}, 8),
-        ("simulated", motion.WALKER, {"bandwidth": 100.0}, 75),
+        ("simulated", motion.WALKER, {"bandwidth": 15.0}, 75),
         ("simulated", motion.WALKER, {"coefficients": 12}, 12),
     ],
 )
@@ -104,6 +104,8 @@ def test_numbers_of_coefficients_that_do_not_exist_are_errors():
         dvae.method("gsps", coefficients="supplement").resolve_defaults(walker)
     with pytest.raises(ValueError, match=r"coefficients is 8 and bandwidth is 2\.8; give only one"):
         dvae.method("gsps", coefficients=8, bandwidth=2.8)
+    with pytest.raises(ValueError, match="bandwidth is 16 Hz, but 30 frames per second contain frequencies up to 15"):
+        dvae.method("gsps", bandwidth=16.0).resolve_defaults(walker)
 
 
 def test_gradients_are_clipped_as_those_of_the_published_loss(windows):
