@@ -62,6 +62,8 @@ def test_scores_have_the_options_of_their_rows(of, run):
     stored_runs = archive.read(name for name in archive.names if name.startswith(f"{run}/"))
     (stored,) = {json.dumps(each["config"]) for each in stored_runs}
     stored = json.loads(stored)
+    if "learned_prior" in stored["method"]:  # former name of the option `prior` of trajevae
+        stored["method"]["prior"] = "learned" if stored["method"]["learned_prior"] else "standard"
     now = {name: value for name, value in method.config().items() if value is not None and not name.endswith("_run")}
     preset = method.preset(WALKER) if isinstance(method, PoseMethod) else {}
     for name, value in json.loads(json.dumps({**preset, **now})).items():
