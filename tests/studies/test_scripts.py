@@ -371,7 +371,7 @@ def test_residual_poses_start_where_segments_start(short):
         def model(self, batch, length, mean_emission):
             return {"x": self.rotations(windows.all())["x"][:, cut.observed :]}
 
-    errors = completion.reference_errors(run, Oracle())["rows"]
+    errors = completion.reference_errors(run, Oracle(), 30.0)["rows"]
     assert max(max(row) for row in errors[completion.SUP].values()) < 5  # mm; frames of chi account for 2
     assert min([*errors[completion.STILL].values()][-1]) > 50
 
@@ -447,7 +447,7 @@ def test_priors(folder, out, monkeypatch):
     small = ["--protocol", "simulated-trajectories", "--width", "8", "--latent", "4"]
     runs = [
         fitted(folder, name, "trajevae", *small, *options)
-        for name, options in {"learned": (), "standard": ("--no-learned-prior", "--no-cosine")}.items()
+        for name, options in {"learned": (), "standard": ("--prior", "standard", "--no-cosine")}.items()
     ]
     priors.main(tuple(runs), out, counts=(0,))
     ((header, *rows),) = tables(out, "trajevae/priors")
