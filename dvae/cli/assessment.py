@@ -169,6 +169,8 @@ def evaluate(
                 f"--bound-particles, --log-score-particles, --pose-prior, --classifier, --joints, --exchange, "
                 f"--temperature and --several-futures do not apply to --measure {measure}; leave them out"
             )
+        if measure == "quality" and samples != ForecastScoring.samples:
+            raise UsageError("--samples does not apply to --measure quality, which draws one future; leave it out")
         if figure is not None and measure != "angles":
             raise UsageError(f"--measure {measure} has no figure; leave --figure out")
         _measure(measure, run, data, scoring, angles, realism, out, figure, seed=seed, batch_size=batch_size)

@@ -18,11 +18,12 @@ the paper: 5,000 epochs of the first phase with batches of 256 and a learning ra
 The paper does not give, and we choose:
 
 * The widths of the layers, here one layer of 256.
-* The reduction of the squared errors, to which the KL is relative. Averages would be so small, next to the KL, that the
-  latent would carry nothing, so we read sums.
+* The reduction over a batch, here the mean. Within a segment, the paper's squared norms are sums.
 * The asymmetry of GradNorm, here 0.12 as in its own paper, the learning rate of the weights, and the layer whose
-  gradients they balance, here the last one that all tasks share. The paper calls its term the squared KL
-  divergence; we use the KL. Weights change by our update of `dvae.GradNorm`, in log w.
+  gradients they balance, here the last one that all tasks share.
+
+Two choices differ from the paper: it calls its term the squared KL divergence, and we use the KL; and the weights of
+the errors change by the update of `dvae.GradNorm` in log w.
 
 Without `published`, training suits short runs (benchmarks/results/motion_latent_4d): normal likelihoods, whose scales
 replace the reduction; weights that equalise gradients (asymmetry 0); and one batch size for both phases.

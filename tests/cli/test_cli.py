@@ -68,6 +68,7 @@ def test_the_route_of_mix_and_match_from_human36m_to_its_measures(capsys, tmp_pa
         assert column in " ".join(capsys.readouterr().out.split())
     assert {path.name for path in Path("run").glob("*.json")} >= {"angles-by-action.json", "quality.json", "codes.json"}
     for arguments, message in (
+        ("quality --samples 2", "--samples does not apply to --measure quality"),
         ("quality --actions", "options of --measure angles do not apply to --measure quality"),
         ("codes --figure a.png", "has no figure"),
         ("codes --bound-particles 2", "do not apply to --measure codes"),

@@ -79,6 +79,8 @@ TRAINING: Mapping[str, Any] = {
 }
 """Options of `Training` from the paper."""
 SCORES = ("quality", "taken for real")
+UNLEARNED = 25.0
+"""Quality in % of zero velocity above which classifiers are not trained enough to compare models."""
 STILL = "zero velocity"
 
 
@@ -250,6 +252,8 @@ class QualityScores(Result):
         title = f"{self.record['protocol']['name']} · {windows} · {self.record['seeds']} classifiers each"
         caption = "quality: 100 % - accuracy of a classifier of real and generated windows; 50 % is the best\n"
         caption += "± standard error over clips ± over seeds of the classifier; 95 %: from both, by Student's t"
+        if STILL in self.rows and self[STILL]["quality"].mean > UNLEARNED:
+            caption += "\nthe classifiers hardly recognise zero velocity: train them on more examples or for more steps"
         table = Table(title=title, caption=caption)
         for header in ("", "quality (%)", "95 %", "taken for real (%)"):
             table.add_column(header, justify="right")

@@ -89,6 +89,16 @@ def test_zero_velocity_is_a_reference_row(people):
     assert result["mine"] == result["zero velocity"]
 
 
+@pytest.mark.parametrize(("level", "is_noted"), [(2.5, False), (50.0, True)])
+def test_a_table_notes_classifiers_that_do_not_recognise_zero_velocity(people, level, is_noted):
+    result = quality_scores(
+        {"mine": lambda x, horizon: x[:, -1:].expand(-1, horizon, -1)}, people, references=True, steps=1
+    )
+    for scores in result.rows.values():
+        scores["quality"][:] = level
+    assert ("hardly recognise zero velocity" in str(result.table().caption)) == is_noted
+
+
 def test_new_samples_of_real_motion_score_at_chance_level():
     """If frames are independent, new samples of the future are as real as the true ones."""
     clips = motion.simulate(clips=30, frames=40, test=0.5)
