@@ -11,10 +11,10 @@ import torch
 from typing_extensions import override
 
 from ..data.batch import WHOLE
-from ..data.schema import Schema
+from ..data.schema import Schema, SchemaError
 from ..data.sequences import RandomMasking, interpolate_missing
 from ..data.views import View
-from ..distributions import DistributionSpec, FixedNormal, Flow, Mixture, Normal, StudentT, Vamp
+from ..distributions import DistributionSpec, Family, FixedNormal, Flow, Mixture, Normal, Product, StudentT, Vamp
 from ..distributions.priors import VampModule
 from ..factorization.inversion import guide
 from ..factorization.notation import Factorization
@@ -87,6 +87,7 @@ class LikelihoodMethod(Method):
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
             an offset: one-step forecasts are sharp, but long forecasts can drift without limit. A smaller share limits
             the drift.
+        scaling: units of the targets of a table in the model; see `dvae.tables.encoding.Scaling`.
         scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
             ignore it. None: 1 for data with a horizon and 0 for others.
@@ -97,6 +98,7 @@ class LikelihoodMethod(Method):
 
     emission: Literal["fixed", "unit", "normal", "student"] | None = None
     residual: Share = 0.0
+    scaling: Literal["columns", "series", "changes", "seasonal"] = "columns"
     scheduled_sampling: Share | None = 0.0
 
     @override
@@ -135,6 +137,8 @@ class LikelihoodMethod(Method):
             kind: class of the model.
             view: view of the model, in place of the data's own.
         """
+        if self.scaling != "columns":
+            schema = self._scaled(schema)
         generative, inference = self.equations()
         names = {name for part in (generative, inference) for name in (*part.variables, *part.context)}
         if extended:
@@ -149,21 +153,30 @@ class LikelihoodMethod(Method):
         model = kind(**{"indicators": schema.indicators, **model_arguments}, view=view or schema.view)
         model.per = schema.per
         for name, coordinates in schema.units.items():
-            model.standardise(name, coordinates)
+            model.standardise(name, coordinates, exposure=schema.exposure if name == WHOLE else None)
         return model
 
-    def of_columns(self, distribution: DistributionSpec) -> DistributionSpec:
-        """Return the distribution of x for a table whose columns define one.
+    def _scaled(self, schema: Schema) -> Schema:
+        """Return the schema with the units of `scaling`.
 
         Raises:
-            ValueError: if `residual` is not 0, because distributions of columns have no residual.
+            SchemaError: if the data are not a table, or its columns do not support these units.
         """
-        if self.residual:
-            raise ValueError(
-                f"residual is {self.residual}, but the table's columns define the distribution of x, which adds no "
-                'previous value; leave residual at 0, or give all columns one distribution with emission="normal"'
+        if not hasattr(schema, "scaled"):
+            raise SchemaError(
+                f"scaling is {self.scaling!r}, which needs a table, but the data are {schema.kind}; use "
+                'scaling="columns", or wrap the data by dvae.tables.PanelData.of'
             )
-        return distribution
+        scaled: Schema = schema.scaled(self.scaling)
+        return scaled
+
+    def of_columns(self, distribution: DistributionSpec) -> DistributionSpec:
+        """Return the distribution of x for a table whose columns define one, with the `residual` of this method.
+
+        Raises:
+            ValueError: if `residual` is not 0 and a distribution has no location to which it can add.
+        """
+        return with_residual(distribution, self.residual) if self.residual else distribution
 
     @override
     def train(self, train: Any, validation: Any = None, steps: int = 2000) -> Recipe:
@@ -256,6 +269,24 @@ class LatentMethod(LikelihoodMethod):
         """Return the objective of training."""
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
         return Evidence(kl_weight=weight, free_bits=self.free_bits)
+
+
+def with_residual(distribution: Any, residual: float) -> Any:
+    """Return the distribution of a table's columns with a share of the previous value in its location.
+
+    Raises:
+        ValueError: if a part has no location.
+    """
+    if isinstance(distribution, Product):
+        parts = tuple((places, with_residual(part, residual)) for places, part in distribution.parts)
+        return replace(distribution, parts=parts)
+    kind = distribution.kind.__name__ if isinstance(distribution, Family) else type(distribution).__name__
+    if not hasattr(distribution, "residual") or (isinstance(distribution, Family) and kind != "Laplace"):
+        raise ValueError(
+            f"residual is {residual}, but {kind} has no location to which the previous value can be added; leave "
+            'residual at 0, give these columns another family, such as real, or use scaling="changes"'
+        )
+    return replace(distribution, residual=residual)
 
 
 def rising(level: float, steps: int) -> Ramp:

@@ -75,6 +75,11 @@ class Schema:
         return [0] * self.size("x")
 
     @property
+    def exposure(self) -> tuple[str, Sequence[int]] | None:
+        """Context variable whose exponential is a known factor of x, and the coordinates of x that it multiplies."""
+        return None
+
+    @property
     def units(self) -> Mapping[str, Sequence[Coordinate]]:
         """Dictionary from variable name to the units of its coordinates."""
         return {}

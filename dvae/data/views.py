@@ -44,6 +44,10 @@ class View:
     """Name of the context variable that contains the data themselves."""
     past: int = 0
     """Number of first frames of x that become context."""
+    exact: tuple[str, ...] = ()
+    """Entries that the view adds in float64 whatever the precision of the model; x is then also read in float64."""
+    by_coordinate: bool = False
+    """Whether the view transforms only some coordinates of x, which must be continuous; others may be discrete."""
     measured: str = ""
     """Quantity that densities refer to, if it is not the data as given; bounds of different quantities differ."""
 
@@ -82,6 +86,14 @@ class View:
             Values (..., B, T, D) by name in the data's representation.
         """
         return model_values
+
+    def following(self, data: Batch) -> Batch:
+        """Return the entries with which `inverse` maps the steps after the last one of a batch.
+
+        Args:
+            data: batch in the model's representation.
+        """
+        return data
 
     def log_det(self, data: Batch) -> Tensor:
         """Return the log absolute determinant of the Jacobian, (B,); 0 for a view that keeps volume.
@@ -160,6 +172,8 @@ class Views(View):
         self.parts = next((view.parts for view in views if view.parts), None)
         self.history = next((view.history for view in views if view.history), None)
         self.past = sum(view.past for view in views)
+        self.exact = tuple(name for view in views for name in view.exact)
+        self.by_coordinate = any(view.by_coordinate for view in views)
         self.measured = ", ".join(view.measured for view in views if view.measured)
         pasts = [index for index, view in enumerate(views) if isinstance(view, Past)]
         if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
@@ -184,6 +198,12 @@ class Views(View):
         for view in reversed(self.views):
             model_values = Batch(view.inverse(model_values))
         return model_values
+
+    @override
+    def following(self, data: Batch) -> Batch:
+        for view in reversed(self.views):
+            data = Batch(view.following(data))
+        return data
 
     @override
     def log_det(self, data: Batch) -> Tensor:

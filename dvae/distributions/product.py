@@ -149,11 +149,12 @@ class ProductModule(ConditionalDistribution):
 
     @override
     def rescale(self, parameters: Parameters, mean: Tensor, scale: Tensor) -> Parameters:
-        scale, rescaled = scale.expand_as(mean), ()
+        scale, rescaled = scale.expand(*scale.shape[:-1], len(mean)), ()
         for distribution, places, values in self.split(parameters):
-            rescaled += (
-                distribution.rescale(values, mean[places], scale[places]) if distribution.location_scale else values
-            )
+            part = scale[..., places]
+            if part.dim() > 1 and not distribution.discrete:
+                part = part.flatten(0, -2)[0]  # an exposure multiplies counts alone
+            rescaled += distribution.rescale(values, mean[places], part) if distribution.location_scale else values
         return rescaled
 
     @override

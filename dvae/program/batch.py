@@ -91,7 +91,7 @@ class Reader:
             raise ValueError(
                 f"the batch has {', '.join(unknown)}; expected only {', '.join(names)}, 'lengths' and 'mask'"
             )
-        exact = {*wide, whole_name, *self.view.names} if wide else set()  # the view computes the variables from these
+        exact = {*wide, whole_name, *self.view.names} if wide or self.view.exact else set()  # the view computes the variables from these
         values = _tensors(Batch(batch), dtype, names, exact)
         if "mask" in values:
             values["mask"] = values.masks(whole_name)
@@ -104,6 +104,7 @@ class Reader:
         )
         if self.density and whole_name in values and values.log_det is None and not self.view.keeps_volume:
             result["log_det"] = self.view.counted(values)
+        wide = {*wide, *self.view.exact}
         narrow = [n for n, v in result.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
         result |= {name: _cast(name, result[name], dtype, result) for name in narrow}
         if "mask" in result:  # masks of context fill its values and are then dropped

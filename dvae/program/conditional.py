@@ -31,11 +31,12 @@ CONSTANT = "1"
 
 @dataclass
 class Standardised:
-    """The state of a network's loop, with the standardised draws so far."""
+    """The state of a network's loop, with the standardised draws so far, and known factors (B, T, R) of the child."""
 
     network: Any
     kept: dict[str, Rows]
     lengths: Tensor | None
+    factors: Tensor | None = None
 
 
 @contextmanager
@@ -113,6 +114,7 @@ class Conditional(nn.Module):
         self.head = distribution.build(Shape(self.size, features, factor.local, factor.child, data, guide))
         self.parents = [parent.name for parent in factor.parents]
         self.units: dict[str, Units] = {}  # the model registers them
+        self.exposure: tuple[str, Sequence[int]] | None = None
         self.discrete = self.head.discrete
         self.reparameterised = self.head.reparameterised and not self.head.discrete
         self.whole = self.head.event_dim == 1
@@ -207,7 +209,11 @@ class Conditional(nn.Module):
         previous = None
         if self.head.residual:
             previous = shift((parents if self._output_units is None else inputs)[self.factor.child], -1)
-        return self._rescale(self.head(features, previous))
+        return self._rescale(self.head(features, previous), self._factors(parents))
+
+    def _factors(self, parents: Mapping[str, Tensor]) -> Tensor | None:
+        """Return the known factors (B, T, R) of the child's scale or rate; None for none."""
+        return None if self.exposure is None else parents[self.exposure[0]].exp()
 
     def _read(self, values: Mapping[str, Tensor], batch: int, lengths: Tensor | None) -> dict[str, Tensor]:
         """Return the parents, standardised and with their indicators; a constant if the factor has none."""
@@ -239,7 +245,7 @@ class Conditional(nn.Module):
         """Units of the child, if the parameters of its distribution can be transformed to them."""
         return self.units.get(self.factor.child) if self.head.location_scale else None
 
-    def _rescale(self, parameters: Parameters) -> Parameters:
+    def _rescale(self, parameters: Parameters, factors: Tensor | None = None) -> Parameters:
         if parameters and torch.is_autocast_enabled(parameters[0].device.type):
             # networks may compute in half precision, but densities, divergences and draws must not
             parameters = tuple(parameter.to(like(self).dtype) for parameter in parameters)
@@ -248,7 +254,11 @@ class Conditional(nn.Module):
             return parameters
         offset = self.offset
         mean = units.mean if offset is None else units.mean - offset
-        return self.head.rescale(parameters, mean.to(units.scale.dtype), units.scale)
+        scale = units.scale
+        if self.exposure is not None and factors is not None:
+            scale = scale.expand(*factors.shape[:-1], self.size).clone()
+            scale[..., list(self.exposure[1])] *= factors.to(scale.dtype)
+        return self.head.rescale(parameters, mean.to(units.scale.dtype), scale)
 
     @property
     def offset(self) -> Tensor | None:
@@ -302,9 +312,10 @@ class Conditional(nn.Module):
         # these are read from the draws, even if given
         child = self.factor.child if self.head.residual and self._output_units is not None else None
         live = [name for name in self.units if name in self.parents and (name not in parents or name == child)]
-        if not live:
+        factors = self._factors(parents)
+        if not live and factors is None:
             return state
-        return Standardised(state, {name: Rows([None] * length) for name in live}, lengths)
+        return Standardised(state, {name: Rows([None] * length) for name in live}, lengths, factors)
 
     def step(
         self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]], count: int = 1
@@ -329,7 +340,8 @@ class Conditional(nn.Module):
             previous = at(
                 (samples if self._output_units is None else inputs)[self.factor.child], t - 1, features, self.size
             )
-        return self._rescale(self.head(features, previous, t)), self._with_network_state(state, inner)
+        factors = state.factors[:, t] if isinstance(state, Standardised) and state.factors is not None else None
+        return self._rescale(self.head(features, previous, t), factors), self._with_network_state(state, inner)
 
     def forward_chunk(
         self, state: Any, t: int, count: int, samples: Mapping[str, Sequence[Tensor]]
@@ -350,7 +362,9 @@ class Conditional(nn.Module):
         if self.head.residual:
             values = (samples if self._output_units is None else inputs)[self.factor.child]
             previous = stack_steps(values, t - 1, count, features, self.size)
-        return self._rescale(self.head(features, previous, t)), self._with_network_state(state, inner)
+        factors = state.factors if isinstance(state, Standardised) else None
+        factors = None if factors is None else factors[:, t : t + count]
+        return self._rescale(self.head(features, previous, t), factors), self._with_network_state(state, inner)
 
     def _standardise_draws(self, state: Any, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
         """Return the state of the network, and the draws standardised as the network reads them."""
@@ -367,8 +381,8 @@ class Conditional(nn.Module):
             return select(state, rows)
         if not isinstance(state, Standardised):
             return self.network.select(state, rows)
-        kept, lengths = select([state.kept, state.lengths], rows)
-        return Standardised(self.network.select(state.network, rows), kept, lengths)
+        kept, lengths, factors = select([state.kept, state.lengths, state.factors], rows)
+        return Standardised(self.network.select(state.network, rows), kept, lengths, factors)
 
     @staticmethod
     def _with_network_state(state: Any, inner: Any) -> Any:

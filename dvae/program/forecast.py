@@ -86,7 +86,8 @@ def forecast(
             name: out[name].unflatten(0, (count, -1)) for name in (*model.observed, *model.latents, *model.summed)
         }
         values |= {name: values[name][:, :, past:] for name in model.observed}
-        values = model.to_data_space(values, rows(data, part))
+        past_inputs = model.view.following(rows(data, part))
+        values = model.to_data_space(values, past_inputs)
         originals = {n: rows(v, part).expand_as(values[n]) for n, v in fixed_data.items() if n in model.observed}
         # fixed values are returned as given, since mapping them to the view and back rounds
         return model.to_data_space({**values, **originals}) if originals else values

@@ -157,7 +157,8 @@ class DynamicalVAE(nn.Module):
         else:
             self.encoder: Any = guides
         self._check_latents()
-        if masses := [name for name in self.observed if self.generator[name].discrete and not self.view.keeps_volume]:
+        changes_all = not (self.view.keeps_volume or self.view.by_coordinate)
+        if masses := [name for name in self.observed if changes_all and self.generator[name].discrete]:
             raise ValueError(
                 f"{self.view} changes volume, but {', '.join(masses)} is discrete; use a view that does not"
             )
@@ -232,7 +233,12 @@ class DynamicalVAE(nn.Module):
                 )
 
     @torch.inference_mode(False)
-    def standardise(self, name: str, coordinates: Sequence[Coordinate] = ()) -> Units:
+    def standardise(
+        self,
+        name: str,
+        coordinates: Sequence[Coordinate] = (),
+        exposure: tuple[str, Sequence[int]] | None = None,
+    ) -> Units:
         """Make the networks read a standardised variable; call `fit` on the result to set mean and scale.
 
         If the distribution of the variable has a location and a scale (`ConditionalDistribution.location_scale`),
@@ -243,15 +249,25 @@ class DynamicalVAE(nn.Module):
             name: name of the variable.
             coordinates: units of each coordinate, such as a column of a table; they replace the mean and scale that
                 `fit` would set.
+            exposure: name of a context variable r_t of the generative factor, and the coordinates of the variable whose
+                scale or rate is multiplied by exp(r_t).
 
         Returns:
             Units of the variable; their `fit` sets mean and scale from data.
 
         Raises:
-            ValueError: if the variable is unknown.
+            ValueError: if the variable is unknown, or its generative factor does not read the exposure.
         """
         if name not in self.sizes:
             raise ValueError(f"no variable {name!r}; there are {', '.join(self.sizes)}")
+        if exposure is not None:
+            factor = self.generator[name].factor
+            if exposure[0] not in self.context or factor.parent(exposure[0]) is None:
+                raise ValueError(
+                    f"{factor} does not read the exposure {exposure[0]}, which must be context; add {exposure[0]}_t to "
+                    "its parents"
+                )
+            self.generator[name].exposure = exposure
         units = Units(self.sizes[name], coordinates, exact=name not in self.latents)
         self.units[name] = units.to(like(self))
         for conditional in (*self.generator.values(), *self.encoder.values()):

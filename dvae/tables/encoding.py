@@ -6,6 +6,7 @@
 | c | standardised covariates known in the future or up to the present; indicators | (B, T, C) |
 | s | standardised covariates with one value per sequence; indicators | (B, S) |
 | d | time since the previous step in median steps, if steps are not evenly spaced | (B, T, 1) |
+| r | logarithm of the level of each count: its mean over earlier observed steps, shrunk to the panel's | (B, T, R) |
 
 A missing entry of a covariate repeats the last value, and its indicator is 0. Before any value, the entry is the mean
 of the training data, or no class for a category. A covariate known up to the present repeats its last value after that.
@@ -15,27 +16,29 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from typing_extensions import override
 
 from ..data.blocks import ColumnSummary, blocks, row_blocks
-from ..data.schema import Schema
+from ..data.batch import Batch
+from ..data.schema import Schema, SchemaError
+from ..data.series_units import LOCATION, SeriesPrior, SeriesUnits
 from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_imprecise
-from ..data.views import ContextView, View
+from ..data.views import ContextView, View, Views
 from ..distributions.base import DistributionSpec
 from ..distributions.family import FAMILIES
 from ..distributions.product import Product
-from ..options import Amount, Positive, Range, tuples
+from ..options import Amount, Positive, Range, require, tuples
 from .calendar import NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
 from .panel import COUNTS, Panel, Series
 from .protocol import Cut
 
-COVARIATES, STATICS, GAPS = "c", "s", "d"
+COVARIATES, STATICS, GAPS, LEVELS_OF_COUNTS = "c", "s", "d", "r"
 """Names of context in batches."""
 EVEN = 1.3
 """Maximum ratio of longest gap to median, and of median to shortest gap, of evenly spaced steps; months are even."""
@@ -45,6 +48,14 @@ CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
 LOGARITHMIC = ("positive", "log-normal", "power")
 """Families whose logarithms networks read."""
 SCALED = (*LOGARITHMIC, *COUNTS)
+Scaling = Literal["columns", "series", "changes", "seasonal"]
+"""Units of the targets in a model.
+
+"columns": mean and scale of each column. "series": level and scale of each sequence. "changes": changes since the last
+value, and "seasonal": since the same step of the last season, relative to their mean and scale in the sequence
+(`dvae.data.series_units`). Other units than "columns" use logarithms of positive data, and the level of a sequence as a
+known factor of its counts.
+"""
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,8 @@ class PanelSchema(Schema):
             present.
         step: median time between steps; 0 if steps are evenly spaced.
         calendar: kind, time zone and calendar step of the times.
+        priors: dictionary from column to the prior of its level and scale by lag, `SeriesPrior` as a tuple.
+        scaling: units of the targets in a model.
     """
 
     kind: ClassVar[str] = "panel"
@@ -74,6 +87,8 @@ class PanelSchema(Schema):
     with_missing: tuple[str, ...] = ()
     step: Amount = 0.0
     calendar: Calendar = NUMBERS
+    priors: Mapping[str, Mapping[str, tuple[float, ...]]] = field(default_factory=dict)
+    scaling: Scaling = "columns"
 
     def __post_init__(self) -> None:
         sizes = {"x": len(self.coordinates)}
@@ -84,6 +99,8 @@ class PanelSchema(Schema):
                 sizes[name] = sum(len(column.coordinates) for column in covariates) + n_indicators
         if self.step:
             sizes[GAPS] = 1
+        if self.counts:
+            sizes[LEVELS_OF_COUNTS] = len(self.counts)
         for name, value in (("sizes", sizes), ("length", self.cut.length), ("observed", self.cut.observed)):
             object.__setattr__(self, name, value)  # derived from the other fields
         super().__post_init__()
@@ -150,6 +167,7 @@ class PanelSchema(Schema):
         median = float(np.median(gaps)) if len(gaps) else 0.0
         step = median if len(gaps) and (gaps.max() > EVEN * median or median > EVEN * gaps.min()) else 0.0
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
+        units["priors"] = _estimate_priors(panel.columns, training, cut)
         return cls(
             columns=panel.columns,
             cut=cut,
@@ -169,11 +187,71 @@ class PanelSchema(Schema):
         """Names of the coordinates of x."""
         return [name for column in self.columns.targets for name in column.coordinates]
 
+    def scaled(self, scaling: str) -> Self:
+        """Return the schema with other units of the targets; see `Scaling`.
+
+        Raises:
+            SchemaError: if no prior of level and scale is known for these units.
+        """
+        require(Scaling, scaling=scaling)
+        schema = replace(self, scaling=scaling)
+        if scaling != "columns" and not any(schema._prior(column) for column in self.columns.targets):
+            names = ", ".join(f"{column.name} ({column.family})" for column in self.columns.targets)
+            raise SchemaError(
+                f"scaling={scaling!r} needs a column of numbers or counts whose training windows have at least 3 "
+                f"values{', and a season of the cut' if scaling == 'seasonal' else ''}; got {names}"
+            )
+        return schema
+
+    @property
+    def counts(self) -> list[int]:
+        """Indices in x of the counts with a prior of their level."""
+        places, start = [], 0
+        for column in self.columns.targets:
+            places += [start] if column.family in COUNTS and "0" in self.priors.get(column.name, {}) else []
+            start += len(column.coordinates)
+        return places
+
+    def _prior(self, column: Column) -> SeriesPrior | None:
+        """Return the prior of level and scale of a column in these units; None for a column without."""
+        lag = {"columns": "", "series": "0", "changes": "1", "seasonal": str(self.cut.season)}[self.scaling]
+        prior = self.priors.get(column.name, {}).get("0" if column.family in COUNTS and lag else lag)
+        return None if prior is None else SeriesPrior(*prior[:-1], bool(prior[-1]))
+
+    def levels(self, batch: Batch) -> Tensor:
+        """Return r (B, T, R): logarithms of the levels of counts, which do not change after the observed steps.
+
+        Args:
+            batch: windows with x (B, T, D), their mask and lengths.
+        """
+        columns = [column for column in self.columns.targets for _ in column.coordinates]
+        priors = [SeriesPrior(*self.priors[columns[n].name]["0"][:-1]) for n in self.counts]
+        view = SeriesUnits(tuple(priors), observed=self.cut.observed)
+        parts = {"x": batch["x"][..., self.counts]}
+        if (mask := batch.mask()) is not None:
+            parts["mask"] = mask[..., self.counts]
+        level: Tensor = view(Batch(parts))[LOCATION]
+        return level.clamp(min=1e-9).log()
+
     @property
     @override
     def view(self) -> View:
-        """View that leaves x unchanged and offers the context as optional inputs."""
-        return ContextView(tuple(name for name in self.sizes if name != "x"))
+        """View that offers the context as optional inputs, and changes x to the units of `scaling`."""
+        context = ContextView(tuple(name for name in self.sizes if name != "x"))
+        if self.scaling == "columns":
+            return context
+        lag = {"series": 0, "changes": 1, "seasonal": self.cut.season or 0}[self.scaling]
+        priors = [
+            None if column.family in COUNTS else self._prior(column)
+            for column in self.columns.targets
+            for _ in column.coordinates
+        ]
+        return Views(SeriesUnits(tuple(priors), lag, self.cut.observed), context) if any(priors) else context
+
+    @property
+    def exposure(self) -> tuple[str, Sequence[int]] | None:
+        """Name of the logarithms of the levels of counts, and the indices of these counts in x; None if not used."""
+        return (LEVELS_OF_COUNTS, self.counts) if self.counts and self.scaling != "columns" else None
 
     @property
     @override
@@ -185,7 +263,8 @@ class PanelSchema(Schema):
             indices = list(range(start, start + len(column.coordinates)))
             start += len(indices)
             event = column.name if column.family == "category" else ""  # each category is a separate event
-            parts.setdefault((column.family, event), []).extend(indices)
+            family = "real" if column.family in LOGARITHMIC and self._prior(column) else column.family
+            parts.setdefault((family, event), []).extend(indices)
         if len(parts) == 1:
             ((family, _),) = parts
             return FAMILIES[family]
@@ -196,6 +275,7 @@ class PanelSchema(Schema):
     def covariates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names of covariates and gaps, and of static covariates."""
         local = tuple(name for name in (COVARIATES, GAPS) if name in self.sizes)
+        local += (LEVELS_OF_COUNTS,) if self.exposure else ()
         return local, ((STATICS,) if STATICS in self.sizes else ())
 
     @property
@@ -217,12 +297,25 @@ class PanelSchema(Schema):
         """Units of x; missing values are replaced by the mean, or by the mean logarithm where logarithms are read."""
         coordinates = []
         for column in self.columns.targets:
+            if prior := self._prior(column):
+                coordinates += [self._relative_units(column, prior)]
+                continue
             mean, scale = self.means.get(column.name, 0.0), self.scales.get(column.name, 1.0)
             logarithm = self.logarithms.get(column.name, ())
             typical = float(np.exp(logarithm[1])) if logarithm else scale if column.family in SCALED else mean
             coordinate = Coordinate(mean, scale, typical, *logarithm)
             coordinates += [coordinate] * len(column.coordinates)
-        return {"x": coordinates}
+        if not self.exposure:
+            return {"x": coordinates}
+        levels = [coordinates[n] for n in self.counts]
+        return {"x": coordinates, LEVELS_OF_COUNTS: [Coordinate(each.level, each.spread, each.level) for each in levels]}
+
+    def _relative_units(self, column: Column, prior: SeriesPrior) -> Coordinate:
+        """Return units of values that are relative to their sequence; networks read logarithms of counts."""
+        if column.family not in COUNTS:
+            return Coordinate()
+        level, spread = self.priors[column.name]["log"]
+        return Coordinate(0.0, 1.0, prior.mean, 0.5, level, spread)
 
     @cached_property
     def places(self) -> dict[str, int]:
@@ -314,6 +407,8 @@ class PanelSchema(Schema):
         """Return the schema as JSON types."""
         entries: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
         entries |= {"with_missing": list(self.with_missing), "step": self.step, "calendar": asdict(self.calendar)}
+        entries["priors"] = {name: {lag: list(each) for lag, each in by.items()} for name, by in self.priors.items()}
+        entries |= {} if self.scaling == "columns" else {"scaling": self.scaling}
         return {"columns": self.columns.config(), "cut": asdict(self.cut), **entries}
 
     @classmethod
@@ -323,8 +418,36 @@ class PanelSchema(Schema):
         options = tuples(config)
         options |= {"columns": Columns.from_config(config["columns"]), "cut": Cut(**config["cut"])}
         options["logarithms"] = tuples(config["logarithms"])
+        options["priors"] = {name: tuples(by) for name, by in config.get("priors", {}).items()}
         options["calendar"] = Calendar(**config["calendar"])
         return cls(**options)
+
+
+def _estimate_priors(
+    columns: Columns, training: Sequence[np.ndarray], cut: Cut
+) -> dict[str, dict[str, tuple[float, ...]]]:
+    """Return the priors of levels and scales by column and lag; "log" has mean and deviation of logarithms of counts.
+
+    Args:
+        columns: columns of the values.
+        training: values (T, C) of training sequences.
+        cut: how sequences are cut into windows, and their season.
+    """
+    priors: dict[str, dict[str, tuple[float, ...]]] = {}
+    for index, column in enumerate(columns.columns):
+        is_count = column.family in COUNTS
+        if column.role != "target" or column.family not in (*CENTRED, *LOGARITHMIC, *COUNTS):
+            continue
+        values = [part[:, index].astype(np.float64) for part in training]
+        by_lag = priors.setdefault(column.name, {})
+        for lag in {0} if is_count else {0, 1, cut.season or 0}:
+            if cut.observed is None or lag <= cut.observed:
+                prior = SeriesPrior.estimate(values, lag, cut.length, column.family in LOGARITHMIC)
+                by_lag[str(lag)] = tuple(map(float, prior))
+        if is_count:
+            logarithms = np.log(np.concatenate(values).clip(0.5))
+            by_lag["log"] = float(np.nanmean(logarithms)), float(np.nanstd(logarithms)) or 1.0
+    return priors
 
 
 def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:

@@ -22,7 +22,7 @@ from ..inference.evaluation.evaluation_windows import on_device_of, seeded_evalu
 from ..options import Count, require
 from ..program.model import DynamicalVAE
 from .calendar import Calendar
-from .encoding import COVARIATES, GAPS, STATICS, PanelSchema, is_whole
+from .encoding import COVARIATES, GAPS, LEVELS_OF_COUNTS, STATICS, PanelSchema, is_whole
 from .forecasts import PanelForecasts, PanelImputed
 from .panel import Panel
 from .protocol import Cut
@@ -183,8 +183,8 @@ class PanelWindows:
     def fingerprint(self) -> str:
         """SHA-256 of the data, their cut, and the split."""
         schema = {
-            name: value for name, value in self.schema.config().items() if name != "calendar"
-        }  # does not affect x
+            name: value for name, value in self.schema.config().items() if name not in ("calendar", "priors")
+        }  # these do not affect x
         digest = hashlib.sha256(f"{self.panel.fingerprint()}({schema!r}, {self.split!r}, ".encode())
         hash_list(digest, self._keys())
         digest.update(b")")
@@ -387,6 +387,8 @@ class PanelWindows:
                 finite.all(-1, keepdim=True).repeat(1, 1, x.shape[-1]) if is_whole(self.schema.columns) else finite
             )
             x.nan_to_num_(0.0)
+        if LEVELS_OF_COUNTS in self.schema.sizes:
+            batch[LEVELS_OF_COUNTS] = self.schema.levels(batch).float()
         for name, values in self._context.items():
             batch[name] = cut_windows(values, ranges, starts, lengths)
         if COVARIATES in batch and (observed := self.schema.cut.observed) is not None:
