@@ -45,7 +45,8 @@ EVEN = 1.3
 LEAST = 1e-7
 """Standard deviation of logarithms below which values count as constant up to rounding errors."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
-LOGARITHMIC = ("positive", "log-normal", "power")
+POSITIVE = ("positive", "log-normal")
+LOGARITHMIC = (*POSITIVE, "power")
 """Families whose logarithms networks read."""
 SCALED = (*LOGARITHMIC, *COUNTS)
 Scaling = Literal["columns", "series", "changes", "seasonal"]
@@ -263,7 +264,7 @@ class PanelSchema(Schema):
             indices = list(range(start, start + len(column.coordinates)))
             start += len(indices)
             event = column.name if column.family == "category" else ""  # each category is a separate event
-            family = "real" if column.family in LOGARITHMIC and self._prior(column) else column.family
+            family = "real" if column.family in POSITIVE and self._prior(column) else column.family
             parts.setdefault((family, event), []).extend(indices)
         if len(parts) == 1:
             ((family, _),) = parts
@@ -436,13 +437,13 @@ def _estimate_priors(
     priors: dict[str, dict[str, tuple[float, ...]]] = {}
     for index, column in enumerate(columns.columns):
         is_count = column.family in COUNTS
-        if column.role != "target" or column.family not in (*CENTRED, *LOGARITHMIC, *COUNTS):
+        if column.role != "target" or column.family not in (*CENTRED, *POSITIVE, *COUNTS):
             continue
         values = [part[:, index].astype(np.float64) for part in training]
         by_lag = priors.setdefault(column.name, {})
         for lag in {0} if is_count else {0, 1, cut.season or 0}:
             if cut.observed is None or lag <= cut.observed:
-                prior = SeriesPrior.estimate(values, lag, cut.length, column.family in LOGARITHMIC)
+                prior = SeriesPrior.estimate(values, lag, cut.length, column.family in POSITIVE)
                 by_lag[str(lag)] = tuple(map(float, prior))
         if is_count:
             logarithms = np.log(np.concatenate(values).clip(0.5))

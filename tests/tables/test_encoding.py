@@ -128,7 +128,7 @@ def test_units_come_from_the_training_sequences():
     share = column(panel, "open", parts).mean()
     assert (means[-1], scales[-1]) == (share, pytest.approx((share * (1 - share)) ** 0.5))
     assert schema.coordinates == ["riders", "kind=u", "kind=v", "kind=w", "temp", "open"]
-    assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2}
+    assert schema.sizes == {"x": 6, "c": 1 + 1 + 2 + 1 + 1 + 1 + 2, "s": 1 + 2, "r": 1}
     assert schema.with_missing == WITH_MISSING
 
 

@@ -74,7 +74,7 @@ def test_every_method_that_is_not_for_motion_is_tested():
 @pytest.mark.parametrize("name", [*METHODS, *PLAIN])
 def test_a_method_fits_and_forecasts_a_table_and_ignores_missing_values(data, name):
     windows = data.windows("train")
-    assert windows.schema.sizes == {"x": 7, "c": 1 + 1 + 2 + 1, "s": 1, "d": 1}
+    assert windows.schema.sizes == {"x": 7, "c": 1 + 1 + 2 + 1, "s": 1, "d": 1, "r": 1}
     method = dvae.method(name, **options(name)).resolve_defaults(windows)
     model = method.build(data.schema)
     recipe = method.train(windows, data.windows("validation"), 2)
