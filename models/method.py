@@ -98,7 +98,7 @@ class LikelihoodMethod(Method):
 
     emission: Literal["fixed", "unit", "normal", "student"] | None = None
     residual: Share = 0.0
-    scaling: Literal["columns", "series", "changes", "seasonal"] = "columns"
+    scaling: Literal["columns", "logs", "series", "changes", "seasonal"] = "columns"
     scheduled_sampling: Share | None = 0.0
 
     @override

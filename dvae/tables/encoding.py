@@ -49,14 +49,16 @@ POSITIVE = ("positive", "log-normal")
 LOGARITHMIC = (*POSITIVE, "power")
 """Families whose logarithms networks read."""
 SCALED = (*LOGARITHMIC, *COUNTS)
-Scaling = Literal["columns", "series", "changes", "seasonal"]
+Scaling = Literal["columns", "logs", "series", "changes", "seasonal"]
 """Units of the targets in a model.
 
-"columns": mean and scale of each column. "series": level and scale of each sequence. "changes": changes since the last
-value, and "seasonal": since the same step of the last season, relative to their mean and scale in the sequence
-(`dvae.data.series_units`). Other units than "columns" use logarithms of positive data, and the level of a sequence as a
-known factor of its counts.
+"columns": mean and scale of each column. "logs": the same, for logarithms of positive data. "series": level and scale of
+each sequence. "changes": changes since the last value, and "seasonal": since the same step of the last season, relative
+to their mean and scale in the sequence (`dvae.data.series_units`). The last three use logarithms of positive data, and
+the level of a sequence as a known factor of its counts.
 """
+FIXED = 1e12
+"""Weight of a prior that observations do not change."""
 
 
 @dataclass(frozen=True)
@@ -215,9 +217,15 @@ class PanelSchema(Schema):
 
     def _prior(self, column: Column) -> SeriesPrior | None:
         """Return the prior of level and scale of a column in these units; None for a column without."""
-        lag = {"columns": "", "series": "0", "changes": "1", "seasonal": str(self.cut.season)}[self.scaling]
-        prior = self.priors.get(column.name, {}).get("0" if column.family in COUNTS and lag else lag)
-        return None if prior is None else SeriesPrior(*prior[:-1], bool(prior[-1]))
+        lags = {"columns": "", "logs": "0", "series": "0", "changes": "1", "seasonal": str(self.cut.season)}
+        lag = "0" if column.family in COUNTS and self.exposure else lags[self.scaling]
+        values = self.priors.get(column.name, {}).get(lag)
+        if values is None or (self.scaling == "logs" and column.family not in POSITIVE):
+            return None
+        prior = SeriesPrior(*values[:-1], bool(values[-1]))
+        if self.scaling == "logs":
+            return prior._replace(mean=prior.level, weight=FIXED, variance=prior.spread**2, freedom=FIXED)
+        return prior
 
     def levels(self, batch: Batch) -> Tensor:
         """Return r (B, T, R): logarithms of the levels of counts, which do not change after the observed steps.
@@ -241,7 +249,7 @@ class PanelSchema(Schema):
         context = ContextView(tuple(name for name in self.sizes if name != "x"))
         if self.scaling == "columns":
             return context
-        lag = {"series": 0, "changes": 1, "seasonal": self.cut.season or 0}[self.scaling]
+        lag = {"changes": 1, "seasonal": self.cut.season or 0}.get(self.scaling, 0)
         priors = [
             None if column.family in COUNTS else self._prior(column)
             for column in self.columns.targets
@@ -252,7 +260,7 @@ class PanelSchema(Schema):
     @property
     def exposure(self) -> tuple[str, Sequence[int]] | None:
         """Name of the logarithms of the levels of counts, and the indices of these counts in x; None if not used."""
-        return (LEVELS_OF_COUNTS, self.counts) if self.counts and self.scaling != "columns" else None
+        return (LEVELS_OF_COUNTS, self.counts) if self.counts and self.scaling not in ("columns", "logs") else None
 
     @property
     @override
