@@ -87,7 +87,8 @@ class LikelihoodMethod(Method):
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
             an offset: one-step forecasts are sharp, but long forecasts can drift without limit. A smaller share limits
             the drift.
-        scaling: units of the targets of a table in the model; see `dvae.tables.encoding.Scaling`.
+        scaling: units of the targets of a table in the model; see `dvae.tables.encoding.Scaling`. None: the units whose
+            reference point is closest to the future in training windows (`PanelSchema.preferred`).
         scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
             ignore it. None: 1 for data with a horizon and 0 for others.
@@ -98,15 +99,18 @@ class LikelihoodMethod(Method):
 
     emission: Literal["fixed", "unit", "normal", "student"] | None = None
     residual: Share = 0.0
-    scaling: Literal["columns", "logs", "series", "changes", "seasonal"] = "columns"
+    scaling: Literal["columns", "logs", "series", "changes", "seasonal"] | None = None
     scheduled_sampling: Share | None = 0.0
 
     @override
     def resolve_defaults(self, data: Any) -> Self:
-        """Return the method with an unset `scheduled_sampling` chosen for the data."""
-        if self.scheduled_sampling is not None:
-            return self
-        return replace(self, scheduled_sampling=float(Schema.of(data).observed is not None))
+        """Return the method with unset `scaling` and `scheduled_sampling` chosen for the data."""
+        schema, options = Schema.of(data), dict[str, Any]()
+        if self.scaling is None:
+            options["scaling"] = getattr(schema, "preferred", "columns")
+        if self.scheduled_sampling is None:
+            options["scheduled_sampling"] = float(schema.observed is not None)
+        return replace(self, **options)
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
@@ -137,7 +141,7 @@ class LikelihoodMethod(Method):
             kind: class of the model.
             view: view of the model, in place of the data's own.
         """
-        if self.scaling != "columns":
+        if self.scaling not in (None, "columns"):
             schema = self._scaled(schema)
         generative, inference = self.equations()
         names = {name for part in (generative, inference) for name in (*part.variables, *part.context)}
@@ -167,7 +171,7 @@ class LikelihoodMethod(Method):
                 f"scaling is {self.scaling!r}, which needs a table, but the data are {schema.kind}; use "
                 'scaling="columns", or wrap the data by dvae.tables.PanelData.of'
             )
-        scaled: Schema = schema.scaled(self.scaling)
+        scaled: Schema = schema.scaled(self.scaling or "columns")
         return scaled
 
     def of_columns(self, distribution: DistributionSpec) -> DistributionSpec:

@@ -26,7 +26,7 @@ from typing_extensions import override
 from ..data.blocks import ColumnSummary, blocks, row_blocks
 from ..data.batch import Batch
 from ..data.schema import Schema, SchemaError
-from ..data.series_units import LOCATION, SeriesPrior, SeriesUnits
+from ..data.series_units import LOCATION, WINDOWS, SeriesPrior, SeriesUnits
 from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_imprecise
 from ..data.views import ContextView, View, Views
 from ..distributions.base import DistributionSpec
@@ -77,6 +77,8 @@ class PanelSchema(Schema):
         calendar: kind, time zone and calendar step of the times.
         priors: dictionary from column to the prior of its level and scale by lag, `SeriesPrior` as a tuple.
         scaling: units of the targets in a model.
+        preferred: units whose reference point is closest to the future in training windows: the mean of the column, the
+            mean of the sequence, its last value or its last season; the default of methods.
     """
 
     kind: ClassVar[str] = "panel"
@@ -92,6 +94,7 @@ class PanelSchema(Schema):
     calendar: Calendar = NUMBERS
     priors: Mapping[str, Mapping[str, tuple[float, ...]]] = field(default_factory=dict)
     scaling: Scaling = "columns"
+    preferred: Scaling = "columns"
 
     def __post_init__(self) -> None:
         sizes = {"x": len(self.coordinates)}
@@ -171,6 +174,7 @@ class PanelSchema(Schema):
         step = median if len(gaps) and (gaps.max() > EVEN * median or median > EVEN * gaps.min()) else 0.0
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
         units["priors"] = _estimate_priors(panel.columns, training, cut)
+        units["preferred"] = _prefer(panel.columns, training, cut)
         return cls(
             columns=panel.columns,
             cut=cut,
@@ -417,7 +421,7 @@ class PanelSchema(Schema):
         entries: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
         entries |= {"with_missing": list(self.with_missing), "step": self.step, "calendar": asdict(self.calendar)}
         entries["priors"] = {name: {lag: list(each) for lag, each in by.items()} for name, by in self.priors.items()}
-        entries |= {} if self.scaling == "columns" else {"scaling": self.scaling}
+        entries |= {n: v for n in ("scaling", "preferred") if (v := getattr(self, n)) != "columns"}
         return {"columns": self.columns.config(), "cut": asdict(self.cut), **entries}
 
     @classmethod
@@ -457,6 +461,31 @@ def _estimate_priors(
             logarithms = np.log(np.concatenate(values).clip(0.5))
             by_lag["log"] = float(np.nanmean(logarithms)), float(np.nanstd(logarithms)) or 1.0
     return priors
+
+
+def _prefer(columns: Columns, training: Sequence[np.ndarray], cut: Cut) -> str:
+    """Return `PanelSchema.preferred`, by mean absolute errors relative to the smallest one of each column."""
+    if cut.observed is None or cut.horizon is None or cut.length is None:
+        return "columns"
+    starts = [(n, t) for n, part in enumerate(training) for t in range(0, len(part) - cut.length + 1, cut.horizon)]
+    starts = starts[:: -(-len(starts) // WINDOWS)]
+    windows = np.stack([training[n][t : t + cut.length] for n, t in starts]).astype(np.float64)
+    totals: dict[str, float] = {}
+    for index, column in enumerate(columns.columns):
+        if column.role != "target" or column.family not in (*CENTRED, *POSITIVE, *COUNTS):
+            continue
+        x = np.log(windows[..., index]) if column.family in POSITIVE else windows[..., index]
+        past, future = np.ma.masked_invalid(x[:, : cut.observed]), np.ma.masked_invalid(x[:, cut.observed :])
+        present = np.maximum.accumulate(np.where(past.mask, -1, np.arange(cut.observed)), 1)[:, -1:]
+        last = np.ma.array(np.take_along_axis(x, present.clip(0), 1), mask=present < 0)
+        points = {"columns": past.mean(), "series": past.mean(1, keepdims=True), "changes": last}
+        if cut.season:
+            points["seasonal"] = past[:, -cut.season :][:, np.arange(cut.horizon) % cut.season]
+        errors = {name: float(np.ma.filled(abs(future - point).mean(), np.inf)) for name, point in points.items()}
+        least = min(errors.values()) or 1.0
+        for name, error in errors.items():
+            totals[name] = totals.get(name, 0.0) + error / least
+    return min(totals, key=lambda name: totals[name], default="columns")
 
 
 def _logarithms(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
