@@ -1,0 +1,148 @@
+"""Fit and score methods on public tables, next to simple forecasts, and write their tables.
+
+Each run has a directory under `--runs` with a file of scores for each scored part. An interrupted script continues and
+skips existing files. Options are chosen with `--part validation`, seed 0; `--part test` scores the runs of three seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+
+import dvae
+from dvae.inference.evaluation.scores import CRPS, Measure, coverage_at
+from dvae.tables.dataset import PanelData
+
+from .engine import OURS, Row, cell, fit_or_load, measure, read, scores_of, settings
+from .results import Table, ordered, tabled, write
+
+FORECASTS = 100
+REFERENCES = "autoregressive"
+"""Case whose first seed also scores the simple forecasts."""
+DVAES = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "dsae", "kvae", "equations")
+"""Methods with latents."""
+LEVEL, COVERAGE = 0.9, "coverage 90 %"
+SECTIONS = settings(__file__)
+
+
+@cache
+def load(name: str) -> PanelData:
+    """Return a table with its default cut."""
+    return PanelData.open(name)
+
+
+def scores(windows: Any) -> list[Measure]:
+    """Return the scores of the tables, divided by the scale of each column in the training data."""
+    return [CRPS, coverage_at(LEVEL)]
+
+
+def run(name: str, part: str, case: str, seed: int, out: Path) -> dict[str, Any]:
+    """Fit and score a case."""
+    data, section = load(name), SECTIONS[name]
+    options = section["cases"][case]
+    train = data.windows("train")
+    method = dvae.method(options.get("method", case), **options.get("options", {})).resolve_defaults(train)
+    training = {**section["training"], **options.get("training", {})}
+    fit = fit_or_load(method, data, train, data.windows("validation"), out=out, seed=seed, **training)
+    evaluation = dvae.evaluate(
+        {OURS: fit.model.eval()},
+        data.windows(part),
+        scores=scores,
+        samples=FORECASTS,
+        seed=seed,
+        training_windows=train,
+        references=case == REFERENCES and seed == 0,
+        progress=False,
+    )
+    rows = {row: each.cluster_means for row, each in evaluation.rows.items()}
+    return {"seconds": fit.processor_seconds, **scores_of(evaluation.clusters, rows)}
+
+
+def rows_of(cases: Mapping[str, Row]) -> tuple[dict[str, Row], dict[str, Row]]:
+    """Return the rows of fitted methods and of simple forecasts, best CRPS first."""
+    first = [one for row in cases.values() for one in row.runs if len(one["rows"]) > 1]
+    simple = {name: Row(first, name, trained=False) for one in first for name in one["rows"] if name != OURS}
+    return ordered(cases, crps), ordered(simple, crps)
+
+
+def crps(row: Row) -> float:
+    """Return the mean CRPS of a row."""
+    estimate = row.estimate("CRPS")
+    assert estimate is not None
+    return estimate.mean
+
+
+def detail(cases: Mapping[str, Row], note: str) -> Table:
+    """Return a table of all rows, best first, with paired differences from the best simple forecast."""
+    methods, simple = rows_of(cases)
+    best = next(iter(simple), None)
+    columns = {
+        "CRPS": lambda row: cell(row.estimate("CRPS")),
+        f"minus {best}": lambda row: "–" if row is simple[best] else cell(row.estimate("CRPS", simple[best])),
+        COVERAGE: lambda row: cell(row.estimate(COVERAGE)),
+    }
+    return tabled(ordered({**methods, **simple}, crps), columns if best else {"CRPS": columns["CRPS"]}, note=note)
+
+
+def summary(available: Mapping[str, Mapping[str, Row]]) -> Table:
+    """Return one line for each table: the best simple forecast, the DVAE that validation chose, and their difference."""
+    lines = []
+    for name, cases in available.items():
+        _, simple = rows_of(cases)
+        best, chosen = next(iter(simple)), SECTIONS[name]["chosen"]
+        row = cases[chosen]
+        difference = cell(row.estimate("CRPS", simple[best]))
+        values = cell(simple[best].estimate("CRPS")), cell(row.estimate("CRPS"))
+        lines.append([name, f"{best}: {values[0]}", f"{chosen}: {values[1]}", difference, cell(row.estimate(COVERAGE))])
+    return Table(["", "best simple forecast, CRPS", "DVAE, CRPS", "difference", COVERAGE], lines)
+
+
+def tables(runs: Path, part: str) -> dict[str, Table]:
+    """Return the tables of the scores on a part."""
+    found, complete = {}, {}
+    for name, section in SECTIONS.items():
+        cases = read(runs / name, section["cases"], f"{part}.json")
+        if not cases:
+            continue
+        first = next(iter(cases.values())).runs
+        minutes = sum(one["seconds"] for row in cases.values() for one in row.runs) / 60
+        note = f"{part.capitalize()}: {sum(first[0]['weights'])} windows of {len(first[0]['clips'])} sequences; "
+        note += f"{len(first)} seeds; all fits took {minutes:.0f} minutes of processor time."
+        found[f"tables/{name}"] = detail(cases, note)
+        if rows_of(cases)[1] and section["chosen"] in cases:
+            complete[name] = cases
+    return found | ({"tables/summary": summary(complete)} if complete else {})
+
+
+def main(
+    names: tuple[str, ...] = tuple(SECTIONS),
+    runs: Path = Path("runs/tables"),
+    results: Path | None = None,
+    part: Literal["validation", "test"] = "validation",
+    cases: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0,),
+) -> None:
+    """Fit, score, and write the tables.
+
+    Args:
+        names: names of the tables to fit; empty to write the results only.
+        runs: folder of the runs.
+        results: folder of the results, such as benchmarks/results; None prints them.
+        part: split to score and to show.
+        cases: names of cases to fit; all cases of a table if empty.
+        seeds: seeds of the runs to fit.
+    """
+    torch.set_num_threads(1)
+    for name in names:
+        chosen = [case for case in SECTIONS[name]["cases"] if not cases or case in cases]
+        measure(runs / name, chosen, seeds, partial(run, name, part), f"{part}.json")
+    write(results, tables(runs, part))
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
