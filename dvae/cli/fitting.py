@@ -83,7 +83,7 @@ else:
     ProtocolName = tyro.extras.literal_type_from_choices(motion.PROTOCOLS)
     SweptMethod = tyro.extras.literal_type_from_choices([name for name in methods() if name != "equations"])
     MethodOptions = options_of("MethodOptions", LatentMethod, "latent")
-    COMMON = ("steps", "batch_size", "learning_rate", "patience", "seed", "accelerator")
+    COMMON = ("steps", "batch_size", "learning_rate", "select", "patience", "seed", "accelerator")
     TrainingOptions = options_of("TrainingOptions", Training, "scheduled_sampling", "progress", common=COMMON)
     SweepOptions = options_of(
         "SweepOptions", Training, "scheduled_sampling", "progress", "seed", "devices", common=COMMON

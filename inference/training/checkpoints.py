@@ -1,7 +1,7 @@
 """Run directories: weights, the state for resuming training, and a description of the run.
 
     config.json        description of the run: method, schema, data, training options
-    best.safetensors   weights at the best unweighted validation bound (absent without validation data)
+    best.safetensors   weights at the best validation score, `Training.select` (absent without validation data)
     last.safetensors   weights at the last checkpoint
     last.state.safetensors  optimiser, random number generators and the state of an objective
     state.json         step, best step and bound, status, and the SHA-256 of the three files above
@@ -64,6 +64,7 @@ _STORED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "waited": (lambda value: _count(value), _NUMBER),
     "status": (lambda value: value in STATUSES, f"one of {', '.join(STATUSES)}"),
     "optimizer": (lambda value: value in OPTIMISERS, f"one of {', '.join(OPTIMISERS)}"),
+    "select": (lambda value: value in (..., "bound", "forecast"), "bound or forecast"),
     "per": (lambda value: value is ... or (isinstance(value, str) and value.isidentifier()), "a word"),
     "processor_seconds": (lambda v: isinstance(v, float) and 0 <= v < math.inf, "a number of at least 0"),
 }

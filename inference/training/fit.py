@@ -30,6 +30,7 @@ from ...program.rollout import ScheduledSampling
 from ..evaluation.result import literal_text, styled
 from . import processes
 from .checkpoints import CONFIG, CheckpointError, Run
+from .forecast_score import NAME, observed_steps
 from .last_value import last_value_bound
 from .objectives import Objective
 from .options import Stage, Training, recorded
@@ -66,10 +67,10 @@ class Fit:
     Args:
         history: rows of the log, in nats per step (see `trackers`).
         step: last step.
-        best_step: step of the best unweighted validation bound; None without validation data.
+        best_step: step of the best validation score (`Training.select`); None without validation data.
         best_bound: best validation bound, in nats per step. With scheduled sampling, it is the bound of the model that
             reads its own output. For a model without a likelihood, or an objective that selects by "loss", it is minus
-            the validation loss.
+            the validation loss; with select="forecast", minus the CRPS.
         status: "finished", "stopped early" or "interrupted".
         run: run directory, or None.
         per: unit that bounds are divided by: a step, unless the model's `per` names another.
@@ -103,6 +104,8 @@ class Fit:
         """Best value and its step as text, with advice if repeating the last value is better; "" without validation."""
         if self.best_bound is None:
             return ""
+        if any(f"validation/{NAME}" in row for row in self.history):
+            return f"lowest validation {NAME} {-self.best_bound:.4f} at step {self.best_step}"
         if any("validation/loss" in row for row in self.history):
             return f"lowest validation loss {-self.best_bound:.4f} at step {self.best_step}"
         scheduled = any("validation/scheduled_sampling/bound" in row for row in self.history)
@@ -205,9 +208,10 @@ def fit(
 ) -> Fit:
     """Fit a model and its guide, or build and fit a method.
 
-    Afterwards the model is in evaluation mode. It has the weights of the best unweighted validation bound, or the last
-    weights without validation data. The caller's random state is restored. Threads share Pyro's handlers and torch's
-    random state, so another fit or forecast waits for the end of the current step.
+    Afterwards the model is in evaluation mode. It has the weights of the best unweighted validation bound, or of the
+    best forecasts (`Training.select`), or the last weights without validation data. The caller's random state is
+    restored. Threads share Pyro's handlers and torch's random state, so another fit or forecast waits for the end of
+    the current step.
 
     Args:
         model: a `DynamicalVAE`, or any module that `SequenceELBO` accepts; or a method, such as `dvae.method("srnn")`.
@@ -347,9 +351,14 @@ def _fit(
         validation = train
     train = take_split(train, "train")
     source = as_source(train)
-    held_out = None if validation is None else as_batches(validation)
+    windows = None if validation is None else take_split(validation, "validation")
+    held_out = None if windows is None else as_batches(windows)
     if training.patience is not None and held_out is None:
         raise ValueError("patience counts validations; pass validation data, or remove patience")
+    observed = None if windows is None else _observed(model, windows)
+    if training.select == "forecast":
+        observed_steps(model, windows)  # raises now rather than at the first validation
+        held_out, observed = windows, None
     # Hashing all data takes time, and only stored runs need it.
     fingerprint = train.fingerprint if out is not None and isinstance(train, Fingerprinted) else None
     record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
@@ -383,7 +392,6 @@ def _fit(
         before, state.status = state.status, _status(state, training)
         if run is not None and (not resume or state.status not in ("running", before)):
             store(svi, run)  # even if the run was interrupted at its last step
-        observed = None if validation is None else _observed(svi.model, take_split(validation, "validation"))
         _train(svi, source, held_out, observed, run, receivers, callbacks, signals)
         processes.wait(svi.fabric)  # the caller may read the files of the first process
         if state.best is not None:

@@ -32,7 +32,9 @@ class Training:
             weights are selected once the schedule has reached it.
         particles: number of draws from the guide for each sequence and step.
         validate_every: number of steps between validations and checkpoints.
-        patience: number of validations without a better bound before the run stops; None to run all steps.
+        select: score that selects the best weights: "bound", or "forecast", the CRPS of 20 forecasts of at most 256
+            validation windows (`forecast_score`).
+        patience: number of validations without a better score before the run stops; None to run all steps.
         log_every: number of steps between rows of the log.
         seed: seed of batches and latent draws; each of several processes derives its own seed from it.
         accelerator: kind of device: "auto", "cpu", "gpu", "cuda" or "mps".
@@ -62,6 +64,7 @@ class Training:
     scheduled_sampling: Share | Schedule = 0.0
     particles: Annotated[int, Range(1, 4096)] = 1
     validate_every: Count = 100
+    select: Literal["bound", "forecast"] = "bound"
     patience: Count | None = None
     log_every: Count = 10
     seed: int = 0

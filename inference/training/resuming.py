@@ -49,7 +49,7 @@ def store(svi: SVI, run: Run) -> None:
     if state.best is not None and state.waited == 0:
         files[BEST] = save_tensors(state.best)
     fields = {name: getattr(state, name) for name in (*_STORED, "per")}
-    run.commit({**fields, "optimizer": svi.training.optimizer}, files)
+    run.commit({**fields, "optimizer": svi.training.optimizer, "select": svi.training.select}, files)
 
 
 def restore(svi: SVI, run: Run) -> None:
@@ -73,6 +73,11 @@ def restore(svi: SVI, run: Run) -> None:
         raise CheckpointError(
             f"{run.path} was fitted with optimizer={stored['optimizer']!r}, not {training.optimizer!r}; resume with "
             "the same optimiser"
+        )
+    if (select := stored.get("select", "bound")) != training.select:
+        raise CheckpointError(
+            f"{run.path} selects weights with select={select!r}, not {training.select!r}; resume with the "
+            "same, because scores of two kinds cannot be compared"
         )
     moments = _moments(svi, run, parts["optimizer"])
     _check_random(svi, run, parts["random"])

@@ -31,6 +31,7 @@ from ..bounds.elbo import SequenceELBO, Terms
 from ..evaluation.result import error_message
 from . import processes
 from .checkpoints import weights
+from .forecast_score import NAME, forecast_score
 from .objectives import AdaptiveObjective, Objective, RequiresDraws, StatefulObjective, WeightedObjective
 from .options import Stage, plan_stages, stage_at
 from .schedules import schedule
@@ -435,20 +436,35 @@ class SVI:
         Without a likelihood, or if the objective selects by "loss", the best weights have the lowest loss. At a stage
         with another objective, this comparison starts again.
 
+        With the option `select="forecast"`, the best weights have the lowest "CRPS" (`forecast_score`) at any step.
+
         Args:
-            data: validation data, as in `evaluate`.
+            data: validation data, as in `evaluate`; windows with `protocol.observed`, to select by forecasts.
         """
         state, row = self.state, self.evaluate(data)
         prefix = "scheduled_sampling/" if self.final_feeding else ""
-        score = -row[f"{prefix}loss"] if "loss" in row else row[f"{prefix}bound"]
+        if by_forecast := self.training.select == "forecast":
+            row[NAME], prefix = self._forecast_score(data), ""
+        by_loss = "loss" in row and not by_forecast
+        score = -row[NAME] if by_forecast else -row[f"{prefix}loss"] if by_loss else row[f"{prefix}bound"]
         if not prefix or self.rates(state.step - 1)["scheduled_sampling"] == self.final_feeding:
             state.waited += 1
-            if "loss" in row and state.best_step is not None and not self._same_objective(state.best_step, state.step):
+            if by_loss and state.best_step is not None and not self._same_objective(state.best_step, state.step):
                 state.best_bound = None  # the best loss so far is of another objective
             if score > (-math.inf if state.best_bound is None else state.best_bound):  # never true of NaN
                 state.best_step, state.best_bound, state.waited = state.step, score, 0
                 state.best = weights(self.model)
         return {f"validation/{name}": value for name, value in row.items()}
+
+    def _forecast_score(self, windows: Any) -> float:
+        """Return the score of forecasts, the same in all processes; infinite if they leave the range of numbers."""
+        try:
+            score = forecast_score(self.model, windows, self.training.batch_size, self.training.seed)
+        except (ValueError, RuntimeError) as error:
+            if not _is_from_distribution(error) or isinstance(error, torch.cuda.OutOfMemoryError):
+                raise
+            score = math.inf  # forecasts may diverge although the bound, given the true past, is finite
+        return float(self.total(torch.tensor(score, dtype=torch.float64))) / self.fabric.world_size
 
     def _same_objective(self, first: int, second: int) -> bool:
         """Return whether two steps have the same objective."""
@@ -595,7 +611,7 @@ def _is_weighted(objective: object) -> bool:
     return isinstance(objective, WeightedObjective) and issubclass(defining["loss"], defining["__call__"])
 
 
-def _is_from_distribution(error: ValueError) -> bool:
+def _is_from_distribution(error: Exception) -> bool:
     """Return whether a distribution raised the error, as torch's do for NaN parameters and values."""
     *_, (frame, _) = walk_tb(error.__traceback__)
     return str(frame.f_globals.get("__name__")).startswith(("torch.distributions", "pyro.distributions"))

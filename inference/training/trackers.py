@@ -2,7 +2,8 @@
 
 A row maps names to numbers, in nats per step. `bound`, `log_likelihood/x` and `kl/z` are of a training batch, and with
 the prefix `validation/` of the validation data. `loss`, `gradient_norm`, `learning_rate` and `scheduled_sampling`
-describe the step, as does `weight/x` for an objective with adaptive weights.
+describe the step, as does `weight/x` for an objective with adaptive weights. `validation/CRPS`, without a unit, is of
+forecasts, if they select the weights (`forecast_score`).
 """
 
 import io
@@ -20,6 +21,7 @@ from ... import files
 from ...lazy import optional
 from ..evaluation.result import PlainConsole, progress_bar
 from .checkpoints import CheckpointError
+from .forecast_score import NAME
 
 LARGEST_LOG = 2**25
 """Largest size of a file of JSON lines, in bytes."""
@@ -244,9 +246,9 @@ class Terminal:
         terms = ("log_likelihood/", "kl/", "energy/") if likelihood else ("energy/",)
         names = [name for name in self._latest if name.startswith(terms)]
         score = "bound" if likelihood else "loss"
-        names += [
-            n for n in (score, f"validation/{score}", f"validation/scheduled_sampling/{score}") if n in self._latest
-        ]
+        scores = (score, f"validation/{score}", f"validation/scheduled_sampling/{score}", f"validation/{NAME}")
+        names += [name for name in scores if name in self._latest]
         labels = [name.replace(f"scheduled_sampling/{score}", f"{score} with scheduled sampling") for name in names]
+        labels = [name.replace(f"/{NAME}", f"/{NAME} (selects)") for name in labels]
         labels = [n.replace("log_likelihood", "log p").removeprefix("energy/").replace("/", " ") for n in labels]
         return "  ".join(f"{label} {self._latest[name]:.3f}" for label, name in zip(labels, names, strict=True))
