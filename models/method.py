@@ -109,7 +109,7 @@ class LikelihoodMethod(Method):
         if self.scaling is None:
             options["scaling"] = getattr(schema, "preferred", "columns")
         if self.scheduled_sampling is None:
-            options["scheduled_sampling"] = float(schema.observed is not None)
+            options["scheduled_sampling"] = float(schema.observed is not None and schema.emission is None)
         return replace(self, **options)
 
     @override
