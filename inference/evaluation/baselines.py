@@ -1,8 +1,9 @@
 """Forecasts of simple statistical methods, with draws, for tables.
 
 All methods work on a scale on which errors are additive: logarithms of positive values, logits of shares, and values
-themselves otherwise. Draws of counts are rounded and at least 0. Parameters come from training windows, and the state
-comes from the steps before the forecast.
+themselves otherwise. Draws of counts are rounded and at least 0. Draws of logarithms stay in the training range,
+widened by its width on both sides. Parameters come from training windows, and the state from the steps before the
+forecast.
 
 | method | draws |
 |---|---|
@@ -11,14 +12,13 @@ comes from the steps before the forecast.
 | seasonal | the last period, plus errors |
 | climatology by series | consecutive steps of the series' own past, continued at its start (Politis and Romano 1992) |
 | AR | means of a linear autoregression, plus errors |
-| ETS | exponential smoothing with damped trend and season, simulated forward (statsmodels) |
+| ETS | means of exponential smoothing with damped trend and season (statsmodels), plus errors |
 | GLM | negative binomial regression of counts |
 
 Errors are whole paths of errors of the same method in training windows. They come from the same series if it has at
 least `OWN` training windows. Otherwise they come from all, multiplied by the ratio of the two windows' scales of
 changes. Errors of drift are also divided and multiplied by their standard deviation for a random walk,
-sqrt(h (1 + h / n)) after a past of n steps. A missing error is taken from another window at the same step. Intervals of
-ETS ignore the uncertainty of its parameters, and are too narrow after a short past.
+sqrt(h (1 + h / n)) after a past of n steps. A missing error is taken from another window at the same step.
 
 Categories and binary columns have no errors: the first three methods repeat their values, and AR, ETS and GLM draw from
 the series' own past.
@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
 from typing import Any
@@ -49,8 +49,10 @@ COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
 LABELS = ("binary", "category")
 OWN = 20
 """Smallest number of training windows of a series whose errors are used alone."""
-FITS, STEPS = 500, 1000
+FITS, STEPS = 500, 300
 """Largest numbers of fits of exponential smoothing, and of steps before the first forecast that a fit reads."""
+ERRORS = 100
+"""Number of training windows that errors of exponential smoothing are from; each needs a fit."""
 MOST = 20_000
 """Largest number of training windows that parameters are estimated from, evenly spaced."""
 Rule = Callable[["Part"], Tensor]
@@ -77,18 +79,25 @@ class Part:
     context: Tensor | None
 
     @classmethod
-    def of(cls, windows: Any, batch: Batch, observed: int, scale: Scale, most: int | None = None) -> Part:
-        """Return windows with their `histories`, or else their observed steps; if there are more than `most`, fewer."""
+    def of(cls, windows: Any, batch: Batch, observed: int, scale: Scale) -> Part:
+        """Return windows with the `histories` that they define, or else with their observed steps."""
         x = scale.forward(batch.mask_to_nan().double())
-        rows = torch.linspace(0, len(x) - 1, min(most or len(x), len(x)), dtype=torch.float64).round().long()
-        values, begin, end = x.flatten(0, 1), torch.arange(len(x)) * x.shape[1], torch.arange(len(x)) * x.shape[1]
-        end = end + observed
+        begin = torch.arange(len(x)) * x.shape[1]
+        values, begin, end = x.flatten(0, 1), begin, begin + observed
         if hasattr(windows, "histories"):
             values, begin, end = windows.histories()
             values = scale.forward(values)
         names = [name for _, name, _ in windows.keys] if isinstance(windows, HeldOutWindows) else [""] * len(x)
-        context = batch["c"][rows].double() if "c" in batch else None
-        return cls(x[rows], [names[row] for row in rows.tolist()], values, begin[rows], end[rows], context)
+        return cls(x, names, values, begin, end, batch["c"].double() if "c" in batch else None)
+
+    def thinned(self, most: int) -> Part:
+        """Return at most `most` windows, evenly spaced."""
+        rows = torch.linspace(0, len(self.x) - 1, min(most, len(self.x)), dtype=torch.float64).round().long()
+        names, context = (
+            [self.names[row] for row in rows.tolist()],
+            None if self.context is None else self.context[rows],
+        )
+        return Part(self.x[rows], names, self.values, self.begin[rows], self.end[rows], context)
 
     @cached_property
     def means(self) -> tuple[Tensor, Tensor]:
@@ -127,7 +136,7 @@ class Scale:
 
     def inverse(self, y: Tensor) -> Tensor:
         """Return valid values of each family."""
-        y = torch.where(self.which(*POSITIVE), y.clamp(-100, 100).exp(), y)
+        y = torch.where(self.which(*POSITIVE), y.exp(), y)
         y = torch.where(self.which("share"), y.sigmoid(), y)
         y = torch.where(self.which("angle"), torch.remainder(y + torch.pi, 2 * torch.pi) - torch.pi, y)
         y = torch.where(self.which("power", *COUNTS), y.clamp(min=0), y)
@@ -243,9 +252,18 @@ class Baselines:
             chance = torch.rand(self.samples, len(point[part]), generator=self._generator(part), dtype=torch.float64)
             donors = order[low[part] + (chance * count[part]).long()]
             size = torch.where((count < len(order))[part, None, None], training[donors], held[part])
-            return self.scale.inverse(point[part] + errors[donors] * size * growths[part])
+            return self._inverse(point[part] + errors[donors] * size * growths[part])
 
         return forecast
+
+    def _inverse(self, draws: Tensor) -> Tensor:
+        """Return draws in units of the data, with logarithms in bounds."""
+        low, high = (
+            self.training.x.nan_to_num(math.inf).amin((0, 1)),
+            self.training.x.nan_to_num(-math.inf).amax((0, 1)),
+        )
+        bounded = draws.clamp(2 * low - high, 2 * high - low)
+        return self.scale.inverse(torch.where(self.scale.which(*POSITIVE), bounded, draws))
 
     @cached_property
     def _donors(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -285,7 +303,7 @@ class Baselines:
         level = torch.where(self.scale.which(*POSITIVE, "share"), 1.0, past.abs().nansum(1) / seen.sum(1).clamp(min=1))
         return (seen.sum(1) - 1).clamp(min=0), squares, level
 
-    # --------------------------------------------------------------------------------------- the past of the same series
+    # ------------------------------------------------------------------------------------------------- own past
 
     def _own_past(self, part: slice) -> Tensor:
         """Draw consecutive steps of a window's own past; a missing value is replaced by that of another draw."""
@@ -323,29 +341,26 @@ class Baselines:
     # ------------------------------------------------------------------------------------------- exponential smoothing
 
     def _smoothing(self) -> Forecaster:
-        """Return simulated futures of exponential smoothing: additive errors, damped trend, and season if there is one.
+        """Return draws of exponential smoothing with damped trend, and with a season if there is one, plus errors.
 
         Each series and column is fitted once, to the steps before its first forecast, and smoothed up to the others.
+        The errors are of `ERRORS` training windows.
         """
-        fits: dict[tuple[str, int, int], tuple[int, Any]] = {}
-        columns, begins, ends = (
-            each.tolist() for each in (self._numbers.nonzero()[:, 0], self.held.begin, self.held.end)
-        )
-        values = self.held.values - self._typical
+        draws = replace(self, training=self.training.thinned(ERRORS))._with_errors(self._smoothed)
+        return lambda part: torch.where(self._numbers, draws(part), self._own_past(part))
 
-        def forecast(part: slice) -> Tensor:
-            draws, rng = self.scale.forward(self._own_past(part)), np.random.default_rng([self.seed, part.start])
-            rows = zip(self.held.names[part], begins[part], ends[part], strict=True)
-            for row, (name, begin, end) in enumerate(rows):
-                for d in columns:
-                    start, fitted = fits.get((name, begin, d), (max(begin, end - STEPS), None))
-                    past = values[start:end, d, None]
-                    past = (interpolate_missing(past, ~past.isnan()) + self._typical[d]).flatten().numpy()
-                    draws[:, row, :, d], fitted = smoothed(past, self.season, self._horizon, self.samples, rng, fitted)
-                    fits[name, begin, d] = start, fitted
-            return self.scale.inverse(draws)
-
-        return forecast
+    def _smoothed(self, part: Part) -> Tensor:
+        means, fits = self._last(part).repeat(1, self._horizon, 1), dict[tuple[Any, ...], tuple[int, Any]]()
+        windows = zip(part.names, part.begin.tolist(), part.end.tolist(), strict=True)
+        for row, (name, begin, end) in enumerate(windows):
+            for d in self._numbers.nonzero().flatten().tolist():
+                key = (name, begin, d) if part is self.held else (row, d)
+                start, fitted = fits.get(key, (max(begin, end - STEPS), None))
+                past = part.values[start:end, d, None] - self._typical[d]
+                past = (interpolate_missing(past, ~past.isnan()) + self._typical[d]).flatten().numpy()
+                means[row, :, d], fitted = smoothed(past, self.season, self._horizon, fitted)
+                fits[key] = start, fitted
+        return means
 
     # -------------------------------------------------------------------------------------------- regression of counts
 

@@ -189,6 +189,8 @@ class Evaluation(Result):
         """
         if self.headline is None or self.best_reference is None:
             raise KeyError("skill needs a reference row and one of the scores CRPS and energy score")
+        if method == self.best_reference:
+            return Score(0.0, 0.0)
         ratio = self.ratio(method, self.best_reference, self.headline)
         return Score(1 - ratio.mean, ratio.standard_error, ratio.freedom)
 

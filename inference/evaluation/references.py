@@ -183,8 +183,8 @@ class References:
     Windows may rename some references by `windows.references`, {new name: name}. The renamed ones are then the default
     rows.
 
-    For tables, last value and seasonal are draws too, and training windows are by default those of the table. For others
-    they are point forecasts, as is the mean: their energy score is a distance, their CRPS an absolute error,
+    For tables, last value and seasonal are draws too, and training windows are by default those of the table.
+    For others they are point forecasts, as is the mean: their energy score is a distance, their CRPS an absolute error,
     and they have no intervals. Climatology is the distribution of futures without knowledge of the past.
 
     Args:
@@ -282,7 +282,7 @@ class References:
         batch = self._training_batch.map(lambda values: values[:, :frames] if values.ndim == 3 else values)
         if (steps := batch["x"].shape[1]) < frames:
             raise ValueError(f"training windows have {steps} steps, expected the {frames} of the windows to forecast")
-        training = Part.of(self._source, batch, held.observed, scale, MOST)
+        training = Part.of(self._source, batch, held.observed, scale).thinned(MOST)
         season = self._period if 1 < (self._period or 0) <= held.observed else None
         options = (held.observed, self.samples, self.seed, season)
         return Baselines(Part.of(held.windows, held.batch, held.observed, scale), training, scale, *options)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from typing import Any
 
@@ -78,38 +77,28 @@ def _design(z: Tensor, slope: Tensor, lags: tuple[int, ...], steps: range) -> Te
     return torch.stack([*columns, constant, slope[:, None].expand_as(constant)], 2)
 
 
-def smoothed(
-    y: np.ndarray, season: int | None, horizon: int, samples: int, rng: np.random.Generator, fitted: Any = None
-) -> tuple[Tensor, Any]:
-    """Return futures `(K, H)` of exponential smoothing ETS(A, Ad, N) or ETS(A, Ad, A), and the fit.
-
-    Errors are normal, with the residual variance divided by degrees of freedom.
+def smoothed(y: np.ndarray, season: int | None, horizon: int, fitted: Any = None) -> tuple[Tensor, Any]:
+    """Return the means `(H,)` of the future by exponential smoothing ETS(A, Ad, N) or ETS(A, Ad, A), and the fit.
 
     Args:
         y: past `(T,)`.
         season: number of steps in a period; used if the past has two periods.
         horizon: H, number of steps.
-        samples: K, number of draws.
-        rng: generator of the errors.
         fitted: fit to a start of this series; None to fit.
     """
     from statsmodels.tsa.exponential_smoothing.ets import ETSModel
 
     if np.ptp(y) == 0:
-        return torch.full((samples, horizon), float(y[-1]), dtype=torch.float64), fitted
+        return torch.full((horizon,), float(y[-1]), dtype=torch.float64), fitted
     centre, scale, period, parameters = fitted or (y.mean(), y.std(), 0, None)
-    if parameters is None and season and season > 1 and len(y) >= max(2 * season, season + LEAST):
+    if parameters is None and season and len(y) >= max(2 * season, season + LEAST):
         period = season
     options = {"seasonal": "add", "seasonal_periods": period} if period else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of convergence; parameters are admissible at every iteration
         model = ETSModel((y - centre) / scale, error="add", trend="add", damped_trend=True, **options)
         result = model.fit(disp=False) if parameters is None else model.smooth(parameters)
-    deviation = math.sqrt(result.sse / max(len(y) - len(result.params), 1))
-    errors = deviation * rng.standard_normal((horizon, samples))
-    futures = result.simulate(horizon, anchor="end", repetitions=samples, random_errors=errors)
-    futures = np.asarray(futures).reshape(horizon, samples).T
-    return torch.from_numpy(centre + scale * futures), (centre, scale, period, result.params)
+    return torch.from_numpy(centre + scale * result.forecast(horizon)), (centre, scale, period, result.params)
 
 
 def negative_binomial(x: Tensor, y: Tensor) -> tuple[Tensor, float]:
