@@ -123,7 +123,7 @@ def evaluate(
     out: Path | None = None,
     figure: Path | None = None,
 ) -> None:
-    """Score runs on the test windows of their protocol, next to zero velocity and nearest neighbours.
+    """Score runs on the test windows of their protocol, next to reference forecasts such as the last value.
 
     For runs of motion-latent, scores the reconstruction of test segments, next to principal components of equal
     dimension. Options for forecasts do not apply to them.
@@ -298,6 +298,10 @@ def _reference_windows(data_set: Any) -> Any:
     size = 4 * len(windows) * windows.length * windows.schema.sizes["x"]
     if size <= MOST_REMEMBERED:
         return windows
+    if hasattr(windows, "subset"):
+        chosen = range(0, len(windows), -(-size // MOST_REMEMBERED))
+        note(f"references use {len(chosen):,} of {len(windows):,} training windows, evenly spaced")
+        return windows.subset(chosen)
     note(
         f"omitted references that use training windows: {len(windows):,} windows would take {size / 2**30:.1f} GB; in "
         "Python, pass fewer to dvae.evaluate as training_windows"

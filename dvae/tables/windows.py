@@ -31,6 +31,8 @@ GROUPED = 8
 """Windows per group in a training batch."""
 AT_ONCE = 64
 """Windows that are forecast or imputed at once."""
+LOADED = 2**28
+"""Largest number of values of training windows that reference forecasts load."""
 NAMED = 10
 """Maximum number of sequences without a window that messages name."""
 
@@ -178,6 +180,35 @@ class PanelWindows:
         }
         entries |= {} if self.protocol.season is None else {"season": self.protocol.season}
         return {**entries, "title": [self.panel.name, self.split]}
+
+    @property
+    def families(self) -> list[str]:
+        """Family of each coordinate of x."""
+        return [column.family for column in self.schema.columns.targets for _ in column.coordinates]
+
+    @cached_property
+    def training(self) -> PanelWindows | None:
+        """Training windows of the same panel, evenly thinned if they are many; None if it has none."""
+        try:
+            windows = PanelWindows(self.panel, self.schema, "train")
+        except ValueError:
+            return None
+        count = min(len(windows), max(LOADED // ((self.length or 1) * self.schema.sizes["x"]), 1))
+        return windows if count == len(windows) else windows.subset(np.linspace(0, len(windows) - 1, count).astype(int))
+
+    def histories(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the targets (S, D) of all sequences, one after another, and the steps that a forecast may use.
+
+        Returns:
+            The targets, NaN where missing; and for each listed window the first step that its forecast may use, and its
+            first future step (N,). With a split by time, the first one is the start of the sequence, which training
+            data contain. Otherwise, it is the first observed step.
+        """
+        ranges, starts = self._windows
+        values = torch.from_numpy(np.concatenate([self.schema.encoded(values) for values in self._values])).double()
+        end = self._first[ranges] + starts + (self.schema.cut.observed or 0)
+        by_time = self.schema.cut.split == "time"
+        return values, self._first[ranges] if by_time else end - (self.schema.cut.observed or 0), end
 
     @property
     def fingerprint(self) -> str:

@@ -30,10 +30,11 @@ from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting, Forecasting
 from ..bounds.elbo import SequenceELBO, iwae_bound
 from ..bounds.predictive import predictive_bound
+from .baselines import Forecaster
 from .evaluation import Evaluation, Row
 from .evaluation_windows import EvaluationWindows, on_device_of, prepare_windows, refuse_non_finite, seeded_evaluation
 from .record import plain
-from .references import Forecaster, References
+from .references import References
 from .result import progress_bar
 from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, cluster_means, proper
 
@@ -77,9 +78,9 @@ def evaluate(
         bound_particles: number of particles of the IWAE bound and its k-hat; 0 omits both.
         log_score_particles: number of particles of the log score (`predictive_bound`); 0 omits it.
         references: whether to add all available reference rows; or the names of some (`References`).
-        training_windows: training data of "mean", "climatology" and "nearest neighbours", such as x (N, T, D); without
-            it these are omitted.
-        season: period of "seasonal", in steps; by default from the windows' description.
+        training_windows: training data of the reference rows, such as x (N, T, D); by default the training part of a
+            table, and else none, so that rows that need them are omitted.
+        season: period of the reference rows, in steps; by default from the windows' description.
         configs: `{name: configuration}`, stored with the rows; any JSON value.
         options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at the mean of the
             prior.
@@ -154,6 +155,7 @@ def evaluate(
         basis={name: value for measure in measures for name, value in measure.basis.items()},
         notes=[
             *dict.fromkeys([*eval_windows.notes, *(measure.note for measure in measures if measure.note)]),
+            *(available.notes if references is True else ()),
             *_forecast_notes(measures, samples, [name for name, each in is_drawn.items() if not each]),
             *(
                 f"{name} is deterministic: its {samples} forecasts of a window are equal, and so is the best of them"

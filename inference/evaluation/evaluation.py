@@ -25,10 +25,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+SKILL = Metric("", "free-running", "higher")
+HEADLINES = ("CRPS", "energy score")
+"""Proper scores that skill is computed from; the first one that an evaluation has is used."""
+FIRST = (*HEADLINES, "ADE", "FDE", "coverage 90 %", "width 90 %", "ELBO")
+"""Scores that a table shows first if it has columns for some only."""
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
 """Arrow for each direction that is better."""
 COLUMNS = 5
-"""Largest number of methods in columns of a table; more are in rows if there are not more metrics."""
+"""Largest number of columns of a table. More methods are in rows, and then only these scores are shown by default."""
 _MOST_RANKS = 10_000  # the envelope of so many ranks takes a second
 
 
@@ -151,6 +156,59 @@ class Evaluation(Result):
             raise ValueError(f"the mean {metric} of {second} is 0, so the ratio is undefined; use difference")
         return self._score(metric, numerator / denominator + (values - numerator / denominator * other) / denominator)
 
+    @property
+    def headline(self) -> str | None:
+        """Proper score that skill is computed from: CRPS, or else the energy score; None if there is neither."""
+        return next((name for name in HEADLINES if name in self.metrics), None)
+
+    @property
+    def best_reference(self) -> str | None:
+        """Reference row with the lowest headline score; None without one.
+
+        Rows without equations are references. Those with a score of 0 are true futures, and are not considered.
+        """
+        if self.headline is None:
+            return None
+        scores = {name: self[name].get(self.headline) for name, row in self.rows.items() if not row.equations}
+        means = {name: score.mean for name, score in scores.items() if score is not None and score.mean > 0}
+        return min(means, key=means.__getitem__, default=None)
+
+    @property
+    def scores(self) -> dict[str, Metric]:
+        """Scores that a table may show: skill, if there is a reference row, and all metrics."""
+        return ({} if self.best_reference is None else {"skill": SKILL}) | self.metrics
+
+    def skill(self, method: str) -> Score:
+        """Return 1 - score / score of the best reference row in the headline score, with its paired linearised error.
+
+        Args:
+            method: name of a method.
+
+        Raises:
+            KeyError: when the method was not evaluated or has no headline score, or there is no reference row.
+        """
+        if self.headline is None or self.best_reference is None:
+            raise KeyError("skill needs a reference row and one of the scores CRPS and energy score")
+        if method == self.best_reference:
+            return Score(0.0, 0.0)
+        ratio = self.ratio(method, self.best_reference, self.headline)
+        return Score(1 - ratio.mean, ratio.standard_error, ratio.freedom)
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Sentences on the models that do not beat the best reference row by two standard errors."""
+        sentences, best, score = [], self.best_reference, self.headline
+        models = [name for name, row in self.rows.items() if row.equations and score in row.cluster_means]
+        for name in models if best and score else ():
+            difference, values = self.difference(name, best, score), f"{score} {self[name][score]}"
+            values = f"{values} against {self[best][score]}"
+            if difference.mean > 2 * difference.standard_error:
+                sentences.append(f"{name} is worse than {best} ({values})")
+            elif not difference.mean < -2 * difference.standard_error:  # or the error is unknown
+                reason = "its error is unknown" if len(self.clusters) == 1 else "within two standard errors"
+                sentences.append(f"{name} is not better than {best} ({values}; difference {difference}, {reason})")
+        return sentences
+
     def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:
         """Return the values of two methods by cluster."""
         means = []
@@ -166,26 +224,36 @@ class Evaluation(Result):
     def table(self, metrics: Sequence[str] | None = None) -> Table:
         """Return a table of mean ± standard error: metrics in rows, methods in columns, by kind of score.
 
-        If there are more than five methods and not more metrics, methods are in rows.
+        The first is "skill" (`skill`), if there is a reference row. If there are more than five methods, methods are in
+        rows.
 
         Args:
-            metrics: names of the metrics to include, in any order; default: all.
+            metrics: names of the metrics to include, in any order; default: all, or five if methods are in rows.
 
         Raises:
             KeyError: when no method has a metric.
         """
+        known, omitted, in_rows = self.scores, list[str](), len(self.rows) > COLUMNS
         for name in metrics or ():
-            if name not in self.metrics:
-                raise KeyError(f"no method has a score {name!r}{nearest(name, self.metrics)}")
-        table = Table(title=self._title(), caption=self._caption(metrics))
+            if name not in known:
+                raise KeyError(f"no method has a score {name!r}{nearest(name, known)}")
+        if metrics is None and in_rows:
+            order = [name for name in dict.fromkeys(["skill", *FIRST, *known]) if name in known]
+            metrics, omitted = order[:COLUMNS], order[COLUMNS:]
+        table = Table(title=self._title(), caption=self._caption(metrics, omitted))
         table.add_column("", no_wrap=True)  # on a narrow terminal numbers wrap, and names do not
         scores = {method: self[method] for method in self.rows}
-        selected = {name: metric for name, metric in self.metrics.items() if metrics is None or name in metrics}
+        selected = {name: metric for name, metric in known.items() if metrics is None or name in metrics}
+        if "skill" in selected:
+            scores = {
+                method: row | ({"skill": self.skill(method)} if self.headline in row else {})
+                for method, row in scores.items()
+            }
         by_program = {
             program: {name: metric for name, metric in selected.items() if metric.program == program}
             for program in ("free-running", "teacher-forced")
         }
-        if len(self.rows) > max(COLUMNS, len(selected)):
+        if in_rows:
             ordered = [*by_program["free-running"], *by_program["teacher-forced"]]
             for name in ordered:
                 metric = selected[name]
@@ -421,7 +489,7 @@ class Evaluation(Result):
         mean, deviations = linearised(cluster_means[valid], np.array(list(self.clusters.values()))[valid])
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 
-    def _caption(self, metrics: Sequence[str] | None) -> str:
+    def _caption(self, metrics: Sequence[str] | None, omitted: Sequence[str]) -> str:
         """Return how errors were computed, and the notes, except those that begin with a metric not in the table."""
 
         def describes(note: str, names: Iterable[str]) -> bool:
@@ -433,7 +501,14 @@ class Evaluation(Result):
         freedom = f"{len(self.clusters) - 1} degrees of freedom"
         cluster, _ = axis_names(self.data)
         error = f"mean ± standard error over windows, clustered by {cluster} ({freedom}); K: forecasts of each window"
-        return "\n".join([error, *notes])
+        shown = self.scores.keys() if metrics is None else {*metrics}
+        lines = [error]
+        if "skill" in shown:
+            lines.append(
+                f"skill: 1 - {self.headline} / {self.headline} of {self.best_reference}, the best reference row"
+            )
+        lines += [*(self.verdicts if {"skill", self.headline} & shown else ()), *notes]
+        return "\n".join([*lines, f"not in this table: {', '.join(omitted)}"] if omitted else lines)
 
     def _title(self) -> str:
         name = str(self.protocol.get("name", ""))

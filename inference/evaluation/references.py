@@ -1,8 +1,9 @@
 """Reference forecasts for any sequences, without a model."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,12 +17,14 @@ from ...data.sequences import (
     take_split,
 )
 from ...options import nearest
+from .baselines import MOST, Baselines, Forecaster, Part, Scale
 from .evaluation_windows import EvaluationWindows
+from .regressions import complete
 
-Forecaster = Callable[[slice], Tensor]
-"""Function from a slice of windows to forecasts (K, B, H, D)."""
 USUAL = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
 """Default reference rows of windows that name none."""
+OF_TABLES = ("last value", "drift", "seasonal", "climatology", "climatology by series", "AR", "ETS", "GLM")
+"""Default reference rows of tables, before nearest neighbours."""
 
 _EXACT = "donot_use_mm_for_euclid_dist"
 
@@ -175,12 +178,14 @@ class References:
     | mean | the mean of every column in the training windows, at all steps | training windows |
     | climatology | K futures of training windows, drawn at random for each window | training windows |
     | nearest neighbours | the futures of the K training windows with the closest last steps | training windows |
+    | drift, climatology by series, AR, ETS, GLM | K draws, as in `baselines` | training windows |
 
     Windows may rename some references by `windows.references`, {new name: name}. The renamed ones are then the default
     rows.
 
-    All but the last two are point forecasts: their energy score is a distance, their CRPS an absolute error, and they
-    have no intervals. Climatology is the distribution of futures without knowledge of the past.
+    For tables, last value and seasonal are draws too, and training windows are by default those of the table.
+    For others they are point forecasts, as is the mean: their energy score is a distance, their CRPS an absolute error,
+    and they have no intervals. Climatology is the distribution of futures without knowledge of the past.
 
     Args:
         held: windows to forecast.
@@ -211,12 +216,13 @@ class References:
                 f"no reference row {name!r}{nearest(name, [*self._names, *self._makers])}; there are "
                 f"{', '.join({**self._names, **self._makers})}"
             )
-        if name in ("mean", "climatology", "nearest neighbours"):
-            return "" if self.training is not None else "training windows"
+        needs_training = name not in ("last value", "seasonal")
+        if needs_training and self._source is None:
+            return "training windows"
         if name == "seasonal" and not 1 <= (self._period or 0) <= self.held.observed:
             got = f", got {self._period}" if self._period else ""
             return f"a season between 1 and the {self.held.observed} observed steps{got}"
-        return ""
+        return self._baselines.missing_requirement(name) if name in OF_TABLES and needs_training else ""
 
     def __getitem__(self, name: str) -> tuple[int, Forecaster]:
         if requirement := self.missing_requirement(name):
@@ -225,8 +231,29 @@ class References:
 
     @property
     def usual(self) -> list[str]:
-        """Available default rows of an evaluation: from `windows.references`, or else all of `USUAL`."""
-        return [name for name in self._names or USUAL if not self.missing_requirement(name)]
+        """Available default rows of an evaluation: from `windows.references`, or else `OF_TABLES` or `USUAL`."""
+        return [name for name in self._defaults if not self.missing_requirement(name)]
+
+    @property
+    def notes(self) -> Iterator[str]:
+        """Note on exponential smoothing, if it is left out."""
+        if "ETS" in self._defaults and self._source is not None and (needed := self.missing_requirement("ETS")):
+            yield f"ETS was left out: it needs {needed}"
+
+    @property
+    def _defaults(self) -> tuple[str, ...]:
+        return tuple(self._names) or ((*OF_TABLES, "nearest neighbours") if self._is_table else USUAL)
+
+    @property
+    def _is_table(self) -> bool:
+        return hasattr(self.held.windows, "families")
+
+    @cached_property
+    def _source(self) -> Any:
+        """Training windows: the given ones, or those of the same table."""
+        if self.training is None:
+            return getattr(self.held.windows, "training", None)
+        return take_split(self.training, "train")
 
     @property
     def _names(self) -> Mapping[str, str]:
@@ -235,13 +262,30 @@ class References:
 
     @property
     def _makers(self) -> dict[str, Callable[[], tuple[int, Forecaster]]]:
+        drawn = {"climatology by series", "drift", "AR", "ETS", "GLM"}
+        drawn |= {"last value", "seasonal"} if self._is_table and self._source is not None else set()
         return {
             "last value": self._last,
             "seasonal": self._seasonal,
             "mean": self._mean,
             "climatology": self._climatology,
             "nearest neighbours": self._neighbours,
-        }
+        } | {name: partial(self._drawn, name) for name in sorted(drawn)}
+
+    def _drawn(self, name: str) -> tuple[int, Forecaster]:
+        return self.samples, self._baselines[name]
+
+    @cached_property
+    def _baselines(self) -> Baselines:
+        held, frames = self.held, self.held.x.shape[1]
+        scale = Scale(getattr(held.windows, "families", ["real"] * held.x.shape[-1]))
+        batch = self._training_batch.map(lambda values: values[:, :frames] if values.ndim == 3 else values)
+        if (steps := batch["x"].shape[1]) < frames:
+            raise ValueError(f"training windows have {steps} steps, expected the {frames} of the windows to forecast")
+        training = Part.of(self._source, batch, held.observed, scale).thinned(MOST)
+        season = self._period if 1 < (self._period or 0) <= held.observed else None
+        options = (held.observed, self.samples, self.seed, season)
+        return Baselines(Part.of(held.windows, held.batch, held.observed, scale), training, scale, *options)
 
     def _last(self) -> tuple[int, Forecaster]:
         return 1, lambda part: last_value(*self._past(part))
@@ -260,6 +304,9 @@ class References:
     def _climatology(self) -> tuple[int, Forecaster]:
         training, gaps = self._training
         futures = interpolate_missing(training, gaps)[:, self.held.observed :]
+        if gaps is not None and self._is_table:  # an interpolated value may be invalid, such as half a count
+            given = torch.where(gaps, training, torch.nan)[:, self.held.observed :]
+            futures = torch.where((filled := complete(given)).isnan(), futures, filled)
         return self.samples, climatology(futures, len(self.held.x), self.samples, self.seed)
 
     def _neighbours(self) -> tuple[int, Forecaster]:
@@ -286,7 +333,7 @@ class References:
 
     @cached_property
     def _training_batch(self) -> Batch:
-        return sequences(take_split(self.training, "train")).batch
+        return sequences(self._source).batch
 
     @cached_property
     def _training(self) -> tuple[Tensor, Tensor | None]:

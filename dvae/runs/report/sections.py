@@ -199,7 +199,7 @@ def evaluated(runs: Runs) -> Section:
         has_pit = any("PIT" in row.histograms for row in evaluation.rows.values())
         calibration_plot = picture(evaluation.plot_calibration(), "calibration of forecasts") if has_pit else ""
         return (
-            tabulated(evaluation.table())
+            tabulated(evaluation.table([*evaluation.scores]))
             + calibration_plot
             + (missing_part(notice) if _row(run, evaluation) is None else "")
         )
