@@ -44,6 +44,7 @@ class ColumnOptions:
         zone: for a table: time zone of its dates, such as Europe/Berlin.
         na_values: for a table: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: for a table: decimal sign of its numbers, if it cannot be detected.
+        calendar: for a table: covariates computed from its dates, also beyond its last row.
     """
 
     columns: tuple[str, ...] = ()
@@ -56,6 +57,7 @@ class ColumnOptions:
     zone: Expert[str | None] = None
     na_values: Expert[tuple[str, ...]] = ()
     decimal: Expert[Literal[".", ","] | None] = None
+    calendar: tuple[Literal["hour", "weekday", "month", "day_of_year"], ...] = ()
 
     def given(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, under their names in `PanelData.open`."""

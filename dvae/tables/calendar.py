@@ -25,6 +25,14 @@ MONTH = 30.4369
 """Mean days of a month."""
 SERIES = 50
 """Maximum number of sequences used to infer the calendar step of a panel."""
+FEATURES = {"hour": 4, "weekday": 7, "month": 4, "day_of_year": 4}
+"""Number of coordinates of each calendar feature.
+
+A weekday is one-hot, since weekends and Fridays follow no smooth curve. Hour, month and day of the year are two
+harmonics of their cycle: 4 coordinates, in which 23 h is near 0 h and December near January. One-hot hours, months or
+days would need 24, 12 or 366 coefficients, more than short tables determine.
+"""
+HARMONICS = 2
 _OFFSET = re.compile(r"(?:UTC)?[-+](?:[01]\d|2[0-3]):[0-5]\d", re.ASCII)
 _DAYS = ("MON", "TUE", "WED", "THU", "FRI", "SAT", "SUN")
 _STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4](?:{'|'.join(_DAYS)}))", re.ASCII)
@@ -123,6 +131,27 @@ class Calendar:
                 )
         gap = np.median(np.diff(times)) if len(times) > 1 else self.gap or 1.0
         return np.asarray(times[-1] + gap * np.arange(1, count + 1))
+
+    def features(self, times: np.ndarray, names: Iterable[str]) -> np.ndarray:
+        """Return calendar features (T, C) of dates (T,), at the local time of their zone.
+
+        Args:
+            times: dates as seconds since 1970.
+            names: names in `FEATURES`.
+        """
+        local, parts = self._local(times), []
+        for name in names:
+            if name == "weekday":
+                parts.append(np.eye(7)[local.day_of_week])
+                continue
+            phase = {
+                "hour": np.asarray(local - local.normalize()) / np.timedelta64(1, "D"),
+                "month": np.asarray(local.month - 1) / 12,
+                "day_of_year": np.asarray(local.day_of_year - 1) / np.where(local.is_leap_year, 366, 365),
+            }[name]
+            angles = 2 * np.pi * phase[:, None] * np.arange(1, HARMONICS + 1)
+            parts.append(np.concatenate([np.sin(angles), np.cos(angles)], 1))
+        return np.concatenate(parts, 1)
 
     def _local(self, times: np.ndarray) -> Any:
         """Return dates as local times of their zone, without a zone."""

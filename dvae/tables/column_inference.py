@@ -79,6 +79,7 @@ class ColumnHints:
         zone: time zone of dates, such as "Europe/Berlin".
         na_values: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
+        calendar: covariates computed from the time, of `dvae.tables.calendar.FEATURES`.
     """
 
     columns: tuple[str, ...] = ()
@@ -92,6 +93,7 @@ class ColumnHints:
     zone: str | None = None
     na_values: tuple[str, ...] = ()
     decimal: str | None = None
+    calendar: tuple[str, ...] = ()
 
     def of(self, frame: Any) -> Columns:
         """Return the schema of a frame; entries that are not given are inferred, as in `infer_columns`.
@@ -147,6 +149,7 @@ class ColumnHints:
             self.zone,
             tuple(dict.fromkeys((*self.na_values, *marks))),
             self.decimal,
+            self.calendar,
         )
         for column in numbers:
             if column_marks := inference.numbers[column.name].marks:

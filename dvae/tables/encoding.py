@@ -7,6 +7,8 @@
 | s | standardised covariates with one value per sequence; indicators | (B, S) |
 | d | time since the previous step in median steps, if steps are not evenly spaced | (B, T, 1) |
 
+c ends with the calendar features of the schema (`Calendar.features`), computed from the times.
+
 A missing entry of a covariate repeats the last value, and its indicator is 0. Before any value, the entry is the mean
 of the training data, or no class for a category. A covariate known up to the present repeats its last value after that.
 """
@@ -25,12 +27,12 @@ from typing_extensions import override
 from ..data.blocks import ColumnSummary, blocks, row_blocks
 from ..data.schema import Schema
 from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_imprecise
-from ..data.views import ContextView, View
+from ..data.views import ContextView, Dequantised, View, Views
 from ..distributions.base import DistributionSpec
 from ..distributions.family import FAMILIES
 from ..distributions.product import Product
 from ..options import Amount, Positive, Range, tuples
-from .calendar import NUMBERS, Calendar
+from .calendar import FEATURES, NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
 from .panel import COUNTS, Panel, Series
 from .protocol import Cut
@@ -82,6 +84,8 @@ class PanelSchema(Schema):
             if covariates:
                 n_indicators = sum(column.name in self.with_missing for column in covariates)
                 sizes[name] = sum(len(column.coordinates) for column in covariates) + n_indicators
+        if self.columns.calendar:
+            sizes[COVARIATES] = sizes.get(COVARIATES, 0) + sum(FEATURES[name] for name in self.columns.calendar)
         if self.step:
             sizes[GAPS] = 1
         for name, value in (("sizes", sizes), ("length", self.cut.length), ("observed", self.cut.observed)):
@@ -172,8 +176,10 @@ class PanelSchema(Schema):
     @property
     @override
     def view(self) -> View:
-        """View that leaves x unchanged and offers the context as optional inputs."""
-        return ContextView(tuple(name for name in self.sizes if name != "x"))
+        """View that offers the context as optional inputs, and adds rounding noise to x if columns declare it."""
+        context = ContextView(tuple(name for name in self.sizes if name != "x"))
+        widths = tuple(column.rounding for column in self.columns.targets for _ in column.coordinates)
+        return Views(Dequantised(widths), context) if any(widths) else context
 
     @property
     @override
@@ -243,7 +249,11 @@ class PanelSchema(Schema):
 
     def context(self, one: Series) -> np.ndarray:
         """Return c (T, C) of a sequence, with future values of all covariates."""
-        return self._fill(one.values, self.columns.of("known", "past"))
+        parts = [self._fill(one.values, columns)] if (columns := self.columns.of("known", "past")) else []
+        if self.columns.calendar:
+            assert one.times is not None  # checked by the panel
+            parts.append(self.calendar.features(one.times, self.columns.calendar))
+        return np.concatenate(parts, 1)
 
     def static(self, one: Series) -> np.ndarray:
         """Return s (S,) of a sequence.

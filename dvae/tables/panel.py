@@ -94,7 +94,7 @@ class Panel:
 
     Raises:
         ValueError: if sequences are empty, have other columns, share a name, are out of order, or have values that are
-            invalid for their column.
+            invalid for their column, or if calendar features lack dates.
     """
 
     series: Sequence[Series]
@@ -106,6 +106,14 @@ class Panel:
     def __post_init__(self) -> None:
         if not self.series:
             raise ValueError(f"{self.name} has no sequences")
+        if self.columns.calendar and (
+            self.calendar.kind != "dates" or any(sequence.times is None for sequence in self.series)
+        ):
+            times = "missing" if any(sequence.times is None for sequence in self.series) else self.calendar.kind
+            raise ValueError(
+                f"calendar is {', '.join(self.columns.calendar)}, but the times of {self.name} are {times}; calendar "
+                "features need dates: name their column as the time, or leave `calendar` out"
+            )
         names: set[str] = set()
         for sequence in self.series:
             label = f"sequence {sequence.name!r} of {self.name}"
@@ -126,27 +134,32 @@ class Panel:
 
     def _check(self) -> frozenset[str]:
         """Check that values are valid for the family of their column; return the names of complete mapped sequences."""
-        kinds: dict[tuple[str, int], list[int]] = {}
+        kinds: dict[tuple[str, int, float], list[int]] = {}
         for index, column in enumerate(self.columns.columns):
-            kinds.setdefault((column.family, len(column.classes)), []).append(index)
+            kinds.setdefault((column.family, len(column.classes), column.rounding), []).append(index)
         ends, start, incomplete = np.cumsum([len(sequence) for sequence in self.series]), 0, set[int]()
         for block in row_blocks(sequence.values for sequence in self.series):
             block = block.astype(np.float64, copy=False)
             absent = np.isnan(block)
             for indices in kinds.values():
-                cells, (is_valid, domain) = block[:, indices], _validity_test(self.columns.columns[indices[0]])
+                cells, kind = block[:, indices], self.columns.columns[indices[0]]
+                is_valid, domain = _validity_test(kind)
                 with np.errstate(invalid="ignore", over="ignore"):
                     valid = is_valid(cells.astype(np.float32))  # in the precision of models
+                    if kind.rounding:
+                        multiple = cells / kind.rounding
+                        valid &= np.abs(multiple - np.rint(multiple)) <= 1e-6 * np.abs(multiple).clip(1)
+                        domain += f", and rounding {kind.rounding:g} multiples of it"
                 invalid = ~(valid & (np.abs(cells) < LARGEST)) & ~absent[:, indices]
                 if invalid.any():
                     row, offset = np.argwhere(invalid)[0]
                     owner, column = np.searchsorted(ends, start + row, "right"), self.columns.columns[indices[offset]]
                     sequence, size = self.series[owner], f", below {LARGEST:g} in size" if valid[row, offset] else ""
                     advice = (
-                        "give it another family" if np.isfinite(cells[row, offset]) else "write NaN for missing values"
+                        f"give it another {'rounding' if kind.rounding else 'family'}" if np.isfinite(cells[row, offset]) else "write NaN for missing values"
                     )
                     raise ValueError(
-                        f"sequence {sequence.name!r} of {self.name} has {cells[row, offset]:g} in row "
+                        f"sequence {sequence.name!r} of {self.name} has {cells[row, offset]:.9g} in row "
                         f"{start + row - ends[owner] + len(sequence)} of column {column.name!r}, but the family "
                         f"{column.family!r} requires {domain}{size}; {advice}"
                     )
