@@ -14,6 +14,7 @@ from ..data.blocks import ColumnSummary, row_blocks
 from ..inference.evaluation.result import Table
 from ..inference.evaluation.scores import samples_needed
 from ..runs import directory as runs
+from ..tables.advice import findings
 from ..tables.dataset import PanelData
 from ..tables.forecasts import BANDS, FORMATS, QUANTILES, column_of, needed
 from ..tables.reading import SUFFIXES, is_domain, schema_beside, written_schema
@@ -191,6 +192,8 @@ def info(paths: Sequence[str], out: Path | None, options: ColumnOptions) -> None
                 markup=False,
                 soft_wrap=True,
             )
+        for finding in findings(panel, data_set.schema.cut, schema_beside(path) == (None, None)):
+            OUT.print(f"note: {finding}", markup=False, soft_wrap=True)
         for description in data_set.parts().values():
             OUT.print(description, markup=False, soft_wrap=True)
         text = written_schema(panel.columns, data_set.schema.cut)

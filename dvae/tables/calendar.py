@@ -81,7 +81,7 @@ class Calendar:
         calendar = replace(self, gap=float(np.median(np.concatenate([np.diff(sequence) for sequence in sampled]))))
         if self.kind != "dates":
             return calendar
-        steps = Counter(_step(self._local(sequence)) for sequence in sampled if len(sequence) > 2)
+        steps = Counter(_step(self.local(sequence)) for sequence in sampled if len(sequence) > 2)
         return replace(calendar, step=steps.most_common(1)[0][0]) if steps else calendar
 
     def to_pandas(self, times: np.ndarray) -> Any:
@@ -112,7 +112,7 @@ class Calendar:
         import pandas as pd
 
         if self.kind == "dates" and count:
-            local = self._local(times)
+            local = self.local(times)
             inferred = _step(local)
             is_daily = inferred in (None, "1D")  # business days are days too
             steps = (self.step, inferred) if is_daily else (inferred, self.step)
@@ -139,7 +139,7 @@ class Calendar:
             times: dates as seconds since 1970.
             names: names in `FEATURES`.
         """
-        local, parts = self._local(times), []
+        local, parts = self.local(times), []
         for name in names:
             if name == "weekday":
                 parts.append(np.eye(7)[local.day_of_week])
@@ -153,7 +153,7 @@ class Calendar:
             parts.append(np.concatenate([np.sin(angles), np.cos(angles)], 1))
         return np.concatenate(parts, 1)
 
-    def _local(self, times: np.ndarray) -> Any:
+    def local(self, times: np.ndarray) -> Any:
         """Return dates as local times of their zone, without a zone."""
         dates = self.to_pandas(times)
         return dates if self.zone is None else dates.tz_localize(None)

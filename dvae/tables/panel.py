@@ -31,7 +31,7 @@ from .calendar import NUMBERS, Calendar
 from .clocks import time_of
 from .column_inference import LARGEST, TIMES, ColumnHints, is_date
 from .columns import Column, Columns
-from .numerals import read_numbers
+from .numerals import is_multiple, read_numbers
 from .parsing import is_duration, is_number, numeric, tabular, texts, times
 
 SPLITS = ("train", "validation", "test")
@@ -142,22 +142,16 @@ class Panel:
             block = block.astype(np.float64, copy=False)
             absent = np.isnan(block)
             for indices in kinds.values():
-                cells, kind = block[:, indices], self.columns.columns[indices[0]]
-                is_valid, domain = _validity_test(kind)
+                cells, (is_valid, domain) = block[:, indices], _validity_test(self.columns.columns[indices[0]])
                 with np.errstate(invalid="ignore", over="ignore"):
                     valid = is_valid(cells.astype(np.float32))  # in the precision of models
-                    if kind.rounding:
-                        multiple = cells / kind.rounding
-                        valid &= np.abs(multiple - np.rint(multiple)) <= 1e-6 * np.abs(multiple).clip(1)
-                        domain += f", and rounding {kind.rounding:g} multiples of it"
                 invalid = ~(valid & (np.abs(cells) < LARGEST)) & ~absent[:, indices]
                 if invalid.any():
                     row, offset = np.argwhere(invalid)[0]
                     owner, column = np.searchsorted(ends, start + row, "right"), self.columns.columns[indices[offset]]
                     sequence, size = self.series[owner], f", below {LARGEST:g} in size" if valid[row, offset] else ""
-                    advice = (
-                        f"give it another {'rounding' if kind.rounding else 'family'}" if np.isfinite(cells[row, offset]) else "write NaN for missing values"
-                    )
+                    other = f"give it another family{' or rounding' if column.rounding else ''}"
+                    advice = other if np.isfinite(cells[row, offset]) else "write NaN for missing values"
                     raise ValueError(
                         f"sequence {sequence.name!r} of {self.name} has {cells[row, offset]:.9g} in row "
                         f"{start + row - ends[owner] + len(sequence)} of column {column.name!r}, but the family "
@@ -368,7 +362,10 @@ def _validity_test(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], 
         "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
         "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
     }
-    return tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
+    is_valid, domain = tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
+    if unit := column.rounding:
+        return (lambda v: is_valid(v) & is_multiple(v, unit)), f"{domain} that are multiples of its rounding, {unit:g}"
+    return is_valid, domain
 
 
 def _counts(values: np.ndarray) -> np.ndarray:
