@@ -146,7 +146,7 @@ class ContextView(View):
 
 @dataclass(frozen=True)
 class Dequantised(View):
-    """Uniform noise on rounded data, which makes bounds of continuous distributions honest.
+    """Uniform noise on rounded data, so that bounds of continuous distributions are bounded.
 
     A density has no bound at a value that occurs repeatedly, so bounds of rounded data can grow without limit. With
     noise u in [-r/2, r/2], the bound is at most log P(x) - log r, where P(x) is the probability that the model assigns

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from .calendar import FEATURES, Calendar
+from .calendar import FEATURES, FLAG, Calendar, functions_of_time
 from .columns import ROUNDED, Column
 from .numerals import is_multiple
-
-if TYPE_CHECKING:
-    from .panel import Panel, Series
-    from .protocol import Cut
+from .panel import Panel, Series
+from .protocol import Cut
 
 SPIKE, REPEATS = 0.05, 20
 """Share and number of equal values that are a spike; REPEATS is also the minimum number of compared rows."""
@@ -23,11 +21,7 @@ ALIGNED = 0.5
 """Share of the pairs of a sequence and a date that have a row, above which sequences have the same dates."""
 YEARS = (1500, 2500)
 """Range of whole numbers that are read as years."""
-FLAG = 20
-"""Maximum number of distinct values of a flag or category."""
-LINEAR = 1e-5
-"""Distance from 1 of the correlation with time, below which a column is a linear function of it."""
-SAME, SAME_CHANGE = 0.999, 0.99
+SAME, SAME_CHANGE = 0.999, 0.95
 """Rank correlations of values and of changes above which one column is a function of another.
 
 Both are required, since all columns with a trend have similar ranks.
@@ -73,56 +67,6 @@ def is_aligned(panel: Panel) -> bool:
     is_year = (joined % 1 == 0).all() and YEARS[0] <= joined.min() and joined.max() <= YEARS[1]
     is_dated = panel.calendar.kind == "dates" or (panel.calendar.kind == "numbers" and is_year)
     return bool(is_dated and len(joined) > ALIGNED * len(times) * len(np.unique(joined)))
-
-
-def functions_of_time(
-    values: Mapping[str, np.ndarray], times: np.ndarray, calendar: Calendar, owners: np.ndarray
-) -> dict[str, str]:
-    """Return columns that are functions of the time, with the argument of the function.
-
-    It is a part of the date, such as "weekday"; "time" for linear functions; or "date" for flags and categories with
-    one value for each date in all sequences.
-
-    Args:
-        values: dictionary from column to its values (N,), NaN where missing; categories as numbers.
-        times: (N,) of the rows.
-        calendar: calendar of the times.
-        owners: (N,), index of the sequence of each row.
-    """
-    keys = {}
-    if calendar.kind == "dates":
-        local = calendar.local(times)
-        keys = {"hour": local.hour, "weekday": local.day_of_week, "day of the month": local.day, "month": local.month}
-        keys |= {"day_of_year": 100 * local.month + local.day}
-    arguments = {}
-    for name, cells in values.items():
-        known = ~np.isnan(cells)
-        x, t, n_levels = cells[known], times[known], len(np.unique(cells[known]))
-        if n_levels < 2:
-            continue
-        arguments[name] = next((key for key, part in keys.items() if _is_function(x, part[known], t, 3)), "")
-        if _is_linear(x, t, owners[known]) or (keys and (x == local.year[known]).all()):
-            arguments[name] = "time"
-        elif not arguments[name] and n_levels <= FLAG and _is_function(x, t, owners[known], 2):
-            arguments[name] = "date"
-    return {name: argument for name, argument in arguments.items() if argument}
-
-
-def _is_function(values: np.ndarray, keys: Any, repeats: np.ndarray, least: int) -> bool:
-    """Return whether each key has one value, and keys occur with `least` different `repeats` on average."""
-    order = np.lexsort((repeats, keys))
-    values, keys, repeats = values[order], np.asarray(keys)[order], repeats[order]
-    same = keys[1:] == keys[:-1]
-    n_repeats = (same & (repeats[1:] != repeats[:-1])).sum()
-    return bool((values[1:] == values[:-1])[same].all() and n_repeats >= (least - 1) * ((~same).sum() + 1))
-
-
-def _is_linear(values: np.ndarray, times: np.ndarray, owners: np.ndarray) -> bool:
-    """Return whether values are one linear function of time, with an intercept for each sequence."""
-    _, owners, counts = np.unique(owners, return_inverse=True, return_counts=True)
-    x, t = (each - (np.bincount(owners, each) / counts)[owners] for each in (values, times))
-    size = float(np.linalg.norm(x) * np.linalg.norm(t))
-    return size > 0 and len(np.unique(t)) >= REPEATS and abs(float(x @ t)) > (1 - LINEAR) * size
 
 
 def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
@@ -177,7 +121,7 @@ def _dated(
             yield f"{name!r} {what}; if its future is known, make it known (--covariates {name})"
         elif argument in FEATURES:
             yield f'{name!r} {what}; calendar = ["{argument}"] (--calendar {argument}) computes it for any date'
-        elif argument == "date" and guessed:
+        elif guessed:
             yield f"{name!r} {what}, and is guessed as known; if its future is unknown, make it past (--past {name})"
 
 

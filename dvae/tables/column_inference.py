@@ -15,7 +15,7 @@ import numpy as np
 
 from ..data.units import RESOLVED
 from ..options import nearest
-from .advice import functions_of_time
+from .calendar import functions_of_time
 from .clocks import PERIOD, is_clock, join_times, parts_of, time_of, unit_of
 from .columns import Column, Columns, Role
 from .numerals import NEARLY_ALL, read_numbers
