@@ -14,6 +14,7 @@ from ..data.blocks import ColumnSummary, row_blocks
 from ..inference.evaluation.result import Table
 from ..inference.evaluation.scores import samples_needed
 from ..runs import directory as runs
+from ..tables.advice import findings
 from ..tables.dataset import PanelData
 from ..tables.forecasts import BANDS, FORMATS, QUANTILES, column_of, needed
 from ..tables.reading import SUFFIXES, is_domain, schema_beside, written_schema
@@ -44,6 +45,7 @@ class ColumnOptions:
         zone: for a table: time zone of its dates, such as Europe/Berlin.
         na_values: for a table: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: for a table: decimal sign of its numbers, if it cannot be detected.
+        calendar: for a table: covariates computed from its dates, also beyond its last row.
     """
 
     columns: tuple[str, ...] = ()
@@ -56,6 +58,7 @@ class ColumnOptions:
     zone: Expert[str | None] = None
     na_values: Expert[tuple[str, ...]] = ()
     decimal: Expert[Literal[".", ","] | None] = None
+    calendar: tuple[Literal["hour", "weekday", "month", "day_of_year"], ...] = ()
 
     def given(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, under their names in `PanelData.open`."""
@@ -189,6 +192,8 @@ def info(paths: Sequence[str], out: Path | None, options: ColumnOptions) -> None
                 markup=False,
                 soft_wrap=True,
             )
+        for finding in findings(panel, data_set.schema.cut, schema_beside(path) == (None, None)):
+            OUT.print(f"note: {finding}", markup=False, soft_wrap=True)
         for description in data_set.parts().values():
             OUT.print(description, markup=False, soft_wrap=True)
         text = written_schema(panel.columns, data_set.schema.cut)

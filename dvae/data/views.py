@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from ..constants import indices
+from ..constants import constant, indices
 from ..factorization.notation import Factorization
 from ..networks.loop import valid_steps
 from .batch import WHOLE, Batch
@@ -113,6 +113,14 @@ class View:
         """Whether the log-determinant is always 0."""
         return type(self).log_det is View.log_det
 
+    def with_volume(self, data: Batch) -> tuple[Batch, Tensor | None]:
+        """Return the data in the model's representation, and `counted`; None if the view keeps volume.
+
+        Args:
+            data: batch in the data's representation.
+        """
+        return Batch(self(data)), None if self.keeps_volume else self.counted(data)
+
     def counted(self, data: Batch) -> Tensor:
         """Return `log_det` without missing entries and padding.
 
@@ -154,6 +162,47 @@ class ContextView(View):
     @override
     def inverse(self, model_values: Batch) -> Batch:
         return Batch({name: value for name, value in model_values.items() if name not in self.names})
+
+
+@dataclass(frozen=True)
+class Dequantised(View):
+    """Uniform noise on rounded data, so that bounds of continuous distributions are bounded.
+
+    A density has no bound at a value that occurs repeatedly, so bounds of rounded data can grow without limit. With
+    noise u in [-r/2, r/2], the bound is at most log P(x) - log r, where P(x) is the probability that the model assigns
+    to the rounded value x (Theis, van den Oord and Bethge, 2016, arXiv 1511.01844, section 3.1). Each reading of the
+    data draws other noise. Values that return to the data, means included, are rounded to multiples of r.
+
+    Args:
+        widths: r of each coordinate of x; 0 for no noise.
+    """
+
+    widths: tuple[float, ...]
+    names = (WHOLE, "rounding_noise")
+    measured = "values with uniform noise of the width of their rounding"
+
+    @override
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        if len(self.widths) != sizes.get(WHOLE):
+            raise ValueError(f"rounding noise has {len(self.widths)} widths, but x has size {sizes.get(WHOLE)}")
+
+    @override
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
+        if WHOLE not in data or "rounding_noise" in data:
+            return data
+        x = data[WHOLE]
+        noise = (torch.rand_like(x) - 0.5) * constant(self.widths, x)
+        return data | {WHOLE: x + noise, "rounding_noise": noise}
+
+    @override
+    def inverse(self, model_values: Batch) -> Batch:
+        values = Batch({name: value for name, value in model_values.items() if name != "rounding_noise"})
+        if WHOLE in values:
+            x = values[WHOLE]
+            widths = constant(self.widths, x)
+            rounded = torch.where(widths > 0, (x / widths.clamp(min=1e-30)).round() * widths, x)
+            values[WHOLE] = x + (rounded - x).detach()  # gradients of energies pass
+        return values
 
 
 class Views(View):
@@ -215,13 +264,19 @@ class Views(View):
         return all(view.keeps_volume for view in self.views)
 
     @override
-    def counted(self, data: Batch) -> Tensor:
+    def with_volume(self, data: Batch) -> tuple[Batch, Tensor | None]:
         terms = []
         for view in self.views:
-            terms += [] if view.keeps_volume else [view.counted(data)]
-            data = Batch(view(data))
+            data, term = view.with_volume(data)  # each view once, because a view may add noise
+            terms += [] if term is None else [term]
         by_sequence = any(each.dim() == 1 for each in terms)
-        return torch.stack([Batch(log_det=each).volume if by_sequence else each for each in terms]).sum(0)
+        terms = [Batch(log_det=each).volume if by_sequence else each for each in terms]
+        return data, torch.stack(terms).sum(0) if terms else None
+
+    @override
+    def counted(self, data: Batch) -> Tensor:
+        log_det = self.with_volume(data)[1]
+        return super().counted(data) if log_det is None else log_det
 
 
 @dataclass(frozen=True)

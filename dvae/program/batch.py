@@ -97,13 +97,14 @@ class Reader:
             values["mask"] = values.masks(whole_name)
             for name, mask in values.masks().items():
                 self._check_mask(name, mask, values)
-        viewed = self.view(values)
+        has_volume = self.density and whole_name in values and values.log_det is None
+        viewed, log_det = self.view.with_volume(values) if has_volume else (Batch(self.view(values)), None)
         made_names = {name for name in viewed if name in self.made and name not in values}
         result = Batch(
             {name: value for name, value in viewed.items() if name not in made_names and name != "view_inputs"}
         )
-        if self.density and whole_name in values and values.log_det is None and not self.view.keeps_volume:
-            result["log_det"] = self.view.counted(values)
+        if log_det is not None:
+            result["log_det"] = log_det
         wide = {*wide, *self.view.exact}
         narrow = [n for n, v in result.items() if n not in wide and isinstance(v, Tensor) and v.is_floating_point()]
         result |= {name: _cast(name, result[name], dtype, result) for name in narrow}

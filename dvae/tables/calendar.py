@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from reprlib import repr as brief
 from typing import Any, Literal, Self
@@ -25,6 +25,18 @@ MONTH = 30.4369
 """Mean days of a month."""
 SERIES = 50
 """Maximum number of sequences used to infer the calendar step of a panel."""
+FEATURES = {"hour": 4, "weekday": 7, "month": 4, "day_of_year": 4}
+"""Number of coordinates of each calendar feature.
+
+A weekday is one-hot, since weekends and Fridays follow no smooth curve. Hour, month and day of the year are two
+harmonics of their cycle: 4 coordinates, in which 23 h is near 0 h and December near January. One-hot hours, months or
+days would need 24, 12 or 366 coefficients, more than short tables determine.
+"""
+HARMONICS = 2
+FLAG = 20
+"""Maximum number of distinct values of a flag or category."""
+LINEAR = 1e-5
+"""Distance from 1 of the correlation with time, below which a column is a linear function of it."""
 _OFFSET = re.compile(r"(?:UTC)?[-+](?:[01]\d|2[0-3]):[0-5]\d", re.ASCII)
 _DAYS = ("MON", "TUE", "WED", "THU", "FRI", "SAT", "SUN")
 _STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4](?:{'|'.join(_DAYS)}))", re.ASCII)
@@ -73,7 +85,7 @@ class Calendar:
         calendar = replace(self, gap=float(np.median(np.concatenate([np.diff(sequence) for sequence in sampled]))))
         if self.kind != "dates":
             return calendar
-        steps = Counter(_step(self._local(sequence)) for sequence in sampled if len(sequence) > 2)
+        steps = Counter(_step(self.local(sequence)) for sequence in sampled if len(sequence) > 2)
         return replace(calendar, step=steps.most_common(1)[0][0]) if steps else calendar
 
     def to_pandas(self, times: np.ndarray) -> Any:
@@ -104,7 +116,7 @@ class Calendar:
         import pandas as pd
 
         if self.kind == "dates" and count:
-            local = self._local(times)
+            local = self.local(times)
             inferred = _step(local)
             is_daily = inferred in (None, "1D")  # business days are days too
             steps = (self.step, inferred) if is_daily else (inferred, self.step)
@@ -124,7 +136,28 @@ class Calendar:
         gap = np.median(np.diff(times)) if len(times) > 1 else self.gap or 1.0
         return np.asarray(times[-1] + gap * np.arange(1, count + 1))
 
-    def _local(self, times: np.ndarray) -> Any:
+    def features(self, times: np.ndarray, names: Iterable[str]) -> np.ndarray:
+        """Return calendar features (T, C) of dates (T,), at the local time of their zone.
+
+        Args:
+            times: dates as seconds since 1970.
+            names: names in `FEATURES`.
+        """
+        local, parts = self.local(times), []
+        for name in names:
+            if name == "weekday":
+                parts.append(np.eye(7)[local.day_of_week])
+                continue
+            phase = {
+                "hour": np.asarray(local - local.normalize()) / np.timedelta64(1, "D"),
+                "month": np.asarray(local.month - 1) / 12,
+                "day_of_year": np.asarray(local.day_of_year - 1) / np.where(local.is_leap_year, 366, 365),
+            }[name]
+            angles = 2 * np.pi * phase[:, None] * np.arange(1, HARMONICS + 1)
+            parts.append(np.concatenate([np.sin(angles), np.cos(angles)], 1))
+        return np.concatenate(parts, 1)
+
+    def local(self, times: np.ndarray) -> Any:
         """Return dates as local times of their zone, without a zone."""
         dates = self.to_pandas(times)
         return dates if self.zone is None else dates.tz_localize(None)
@@ -138,6 +171,60 @@ class Calendar:
 
 NUMBERS = Calendar()
 """Calendar for times that are plain numbers."""
+
+
+def functions_of_time(
+    values: Mapping[str, np.ndarray], times: np.ndarray, calendar: Calendar, owners: np.ndarray
+) -> dict[str, str]:
+    """Return columns that are functions of the time, with the argument of the function.
+
+    It is a part of the date, such as "weekday"; "time" for linear functions; or "date" for flags and categories with
+    one value for each date in all sequences.
+
+    Args:
+        values: dictionary from column to its values (N,), NaN where missing; categories as numbers.
+        times: (N,) of the rows.
+        calendar: calendar of the times.
+        owners: (N,), index of the sequence of each row.
+    """
+    keys = {}
+    if calendar.kind == "dates":
+        local = calendar.local(times)
+        keys = {"hour": local.hour, "weekday": local.day_of_week, "day of the month": local.day, "month": local.month}
+        keys |= {"day_of_year": 100 * local.month + local.day}
+    arguments = {}
+    for name, cells in values.items():
+        known = ~np.isnan(cells)
+        x, t, n_levels = cells[known], times[known], len(np.unique(cells[known]))
+        if n_levels < 2:
+            continue
+        arguments[name] = next((key for key, part in keys.items() if _is_function(x, part[known], t)), "")
+        if _is_linear(x, t, owners[known]) or (keys and (x == local.year[known]).all()):
+            arguments[name] = "time"
+        elif not arguments[name] and n_levels <= FLAG and _is_function(x, t, owners[known]):
+            arguments[name] = "date"
+    return {name: argument for name, argument in arguments.items() if argument}
+
+
+def _is_function(values: np.ndarray, keys: Any, repeats: np.ndarray) -> bool:
+    """Return whether each key has one value, and enough keys occur with several `repeats` to show it."""
+    n_repeats = n_keys = 0
+    for rows in (slice(2000), slice(None)):  # few rows reject most columns
+        order = np.lexsort((repeats[rows], keys[rows]))
+        x, key, repeat = (np.asarray(each[rows])[order] for each in (values, keys, repeats))
+        same = key[1:] == key[:-1]
+        if (x[1:] != x[:-1])[same].any():
+            return False
+        n_repeats, n_keys = int((same & (repeat[1:] != repeat[:-1])).sum()), int((~same).sum()) + 1
+    return n_repeats >= max(FLAG, n_keys)
+
+
+def _is_linear(values: np.ndarray, times: np.ndarray, owners: np.ndarray) -> bool:
+    """Return whether values are one linear function of time, with an intercept for each sequence."""
+    _, owners, counts = np.unique(owners, return_inverse=True, return_counts=True)
+    x, t = (each - (np.bincount(owners, each) / counts)[owners] for each in (values, times))
+    size = float(np.linalg.norm(x) * np.linalg.norm(t))
+    return size > 0 and len(np.unique(t)) >= FLAG and abs(float(x @ t)) > (1 - LINEAR) * size
 
 
 def seconds(dates: Any) -> np.ndarray:

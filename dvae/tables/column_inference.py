@@ -15,7 +15,8 @@ import numpy as np
 
 from ..data.units import RESOLVED
 from ..options import nearest
-from .clocks import PERIOD, is_clock, join_times, parts_of, unit_of
+from .calendar import functions_of_time
+from .clocks import PERIOD, is_clock, join_times, parts_of, time_of, unit_of
 from .columns import Column, Columns, Role
 from .numerals import NEARLY_ALL, read_numbers
 from .parsing import (
@@ -30,6 +31,7 @@ from .parsing import (
     is_number,
     tabular,
     texts,
+    times,
 )
 
 CLASSES = 20
@@ -79,6 +81,7 @@ class ColumnHints:
         zone: time zone of dates, such as "Europe/Berlin".
         na_values: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
+        calendar: covariates computed from the time, of `dvae.tables.calendar.FEATURES`.
     """
 
     columns: tuple[str, ...] = ()
@@ -92,6 +95,7 @@ class ColumnHints:
     zone: str | None = None
     na_values: tuple[str, ...] = ()
     decimal: str | None = None
+    calendar: tuple[str, ...] = ()
 
     def of(self, frame: Any) -> Columns:
         """Return the schema of a frame; entries that are not given are inferred, as in `infer_columns`.
@@ -147,6 +151,7 @@ class ColumnHints:
             self.zone,
             tuple(dict.fromkeys((*self.na_values, *marks))),
             self.decimal,
+            self.calendar,
         )
         for column in numbers:
             if column_marks := inference.numbers[column.name].marks:
@@ -185,6 +190,7 @@ def infer_columns(frame: Any) -> Columns:
       are joined if one column alone leaves several rows at the same time.
     - Ids: repeated texts, and integers with the name of an id, if they distinguish rows with the same time.
     - Static: columns that are constant within each of several sequences.
+    - Known: functions of the date, such as weekdays, and flags that are equal in all sequences at each date.
     - Targets: all other columns. Integers from 0 are counts, two values are binary, few texts are a category, and
       numbers above 0 whose standard deviation exceeds half their mean are positive.
 
@@ -258,12 +264,36 @@ class _Inference:
             and len(groups := self.plain.groupby(self._keys(self.id), observed=True, dropna=False)) > 1
         ):
             changing = groups[[*columns]].nunique().max() > 1
-            columns = {name: guess if changing[name] else _static(guess) for name, guess in columns.items()}
+            columns = {
+                name: guess if changing[name] else _covariate(guess, "static") for name, guess in columns.items()
+            }
+        known = self._known([name for name, guess in columns.items() if guess.role == "target"], hints)
+        if any(guess.role == "target" and name not in known for name, guess in columns.items()):
+            columns |= {name: _covariate(columns[name], "known") for name in known if name not in families}
         if not columns and not families:
             reasons = ", ".join(f"{name!r} ({self.reason(name)})" for name in [*frame][:20])
             single = "; separators are , ; tab and |, others are named by a first line such as sep=:"
             raise ValueError(f"no column can be a target: {reasons}{single if frame.shape[1] == 1 else ''}")
         self.columns = columns
+
+    def _known(self, names: list[str], hints: ColumnHints) -> list[str]:
+        """Return columns that are functions of the time."""
+        if not self.time:
+            return []
+        groups = self.frame.groupby(self._keys(self.id), observed=True, dropna=False) if self.id else None
+        owners = np.zeros(len(self.frame), int) if groups is None else groups.ngroup().to_numpy()
+        cells = {}
+        for name in names:
+            parsed, codes = self.numbers[name], self.frame[name].astype("category").cat.codes.to_numpy(float)
+            is_class = parsed.wrong.any() or self._holds_codes(name)
+            cells[name] = np.where(codes < 0, np.nan, codes) if is_class else parsed.values
+        with warnings.catch_warnings(), suppress(ValueError, TypeError):  # reading the table repeats both
+            warnings.simplefilter("ignore")
+            time = self.time if len(self.time) > 1 else self.time[0]
+            rows = None if groups is None else [np.sort(indices) for indices in groups.indices.values()]
+            moments, calendar = times(time_of(self.frame, time, hints.decimal), hints.zone, rows)
+            return [*functions_of_time(cells, moments, calendar, owners)]
+        return []
 
     def _holds_codes(self, name: str) -> bool:
         """Return whether texts are classes or codes, such as 007, although they could be parsed as numbers."""
@@ -577,9 +607,9 @@ def _first(values: Any) -> str:
     return brief(str(values.dropna().iloc[0]))
 
 
-def _static(column: Column) -> Column:
+def _covariate(column: Column, role: Role) -> Column:
     family = "category" if column.family == "category" else "real"
-    return replace(column, role="static", family=family)
+    return replace(column, role=role, family=family)
 
 
 def _unit(cell: str) -> str | None:

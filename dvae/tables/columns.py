@@ -4,6 +4,7 @@ id = ["station"]                      # identify sequences
 time = "date"                         # or ["date", "hour"], which are joined
 zone = "Europe/Berlin"                # time zone, if the times do not name it
 na_values = ["?"]                     # mark missing values
+calendar = ["weekday", "month"]       # covariates computed from the time: hour, weekday, month, day_of_year
 group = "region"                      # group of each sequence, for panels
 split = "part"                        # train, validation or test, if the data define it
 
@@ -14,6 +15,9 @@ unit = "people"
 [columns.temperature]
 role = "known"                        # a covariate that is also known in the future, such as a plan
 unit = "°C"
+
+[columns.level]
+rounding = 0.5                        # values are rounded to multiples of this (`dvae.data.views.Dequantised`)
 
 [columns.weather]
 role = "past"                         # a covariate that is known up to the present
@@ -36,12 +40,14 @@ from reprlib import repr as brief
 from typing import Any, Literal, Self
 
 from ..distributions.family import FAMILIES
-from ..options import check, nearest, tuples
-from .calendar import check_zone
+from ..options import Amount, check, nearest, tuples
+from .calendar import FEATURES, check_zone
 
 Role = Literal["target", "known", "past", "static"]
 WHOLE_STEPS = ("correlated",)
 """Families with one joint distribution over all their columns, whose values are observed or missing together."""
+ROUNDED = ("real", "fixed", "robust", "laplace", "mixture", "correlated", "positive", "log-normal", "share")
+"""Families that allow rounding noise."""
 MOST = 4096
 """Maximum number of columns of a table, and of classes of a column."""
 _CHAIN = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"(?:\\.|[^"\\\n])*+"|'[^'\n]*+')\s*\.\s*){64}""")
@@ -60,9 +66,12 @@ class Column:
         unit: unit of the values, for tables and figures.
         classes: classes of a category, in the order of its coordinates.
         other: class that represents every unlisted value; "" raises an error for such values.
+        rounding: unit to which the values of a continuous target are rounded; models add uniform noise of this width
+            (`dvae.data.views.Dequantised`). 0 for none.
 
     Raises:
-        ValueError: if the family is unknown, a category has no classes, or `other` is not one of them.
+        ValueError: if the family is unknown, a category has no classes, `other` is not one of them, or rounding does
+            not apply to the family.
     """
 
     name: str
@@ -70,7 +79,8 @@ class Column:
     family: str = "real"
     unit: str = ""
     classes: tuple[str, ...] = ()
-    other: str = field(default="", repr=False)  # fingerprints of panels include all other fields
+    other: str = field(default="", repr=False)  # fingerprints of panels include the fields above
+    rounding: Amount = field(default=0.0, repr=False)
 
     def __post_init__(self) -> None:
         check(self)
@@ -95,6 +105,11 @@ class Column:
                 f"column {self.name!r} has other = {self.other!r}{nearest(self.other, self.classes)}, which is not one "
                 f"of its classes, {brief(self.classes)}; add it to them"
             )
+        if self.rounding and (self.role != "target" or self.family not in ROUNDED):
+            raise ValueError(
+                f"column {self.name!r} has rounding = {self.rounding:g}, but is a {self.role} of family "
+                f"{self.family!r}; rounding is for targets of a continuous family: {', '.join(ROUNDED)}"
+            )
 
     @property
     def coordinates(self) -> list[str]:
@@ -116,10 +131,12 @@ class Columns:
         zone: time zone, such as "Europe/Berlin", of dates without an offset from UTC.
         na_values: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
+        calendar: covariates that are computed from the time, of `dvae.tables.calendar.FEATURES`. They are known in the
+            future. Any other calendar, such as holidays, is a column with the role "known".
 
     Raises:
         ValueError: if two columns share a name, no column is a target, the zone is unknown or given without a time, or
-            the decimal sign is invalid.
+            the decimal sign or a calendar feature is invalid.
     """
 
     columns: tuple[Column, ...]
@@ -130,8 +147,15 @@ class Columns:
     zone: str | None = field(default=None, repr=False)  # fingerprints of panels include times and values
     na_values: tuple[str, ...] = field(default=(), repr=False)
     decimal: str | None = field(default=None, repr=False)
+    calendar: tuple[str, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
+        for name in self.calendar:
+            if name not in FEATURES or self.calendar.count(name) > 1:
+                raise ValueError(
+                    f"calendar is {', '.join(self.calendar)}; expected some of {', '.join(FEATURES)}, each at most once"
+                    f"{nearest(name, FEATURES)}"
+                )
         if not isinstance(self.time, str | None):
             time = tuple(self.time)
             object.__setattr__(self, "time", time if len(time) > 1 else (*time, None)[0])
@@ -220,11 +244,11 @@ class Columns:
         entries: dict[str, Any] = {"id": list(self.id), "time": time, "group": self.group, "split": self.split}
         # fingerprints of windows hash these entries: default values stay out
         entries |= {name: value for name in ("zone", "decimal") if (value := getattr(self, name))}
-        entries |= {"na_values": list(self.na_values)} if self.na_values else {}
+        entries |= {name: list(value) for name in ("na_values", "calendar") if (value := getattr(self, name))}
         columns = {}
         for column in self.columns:
             values = {entry.name: getattr(column, entry.name) for entry in fields(Column) if entry.name != "name"}
-            values |= {"other": column.other} if values.pop("other") else {}
+            values = {name: value for name, value in values.items() if value or name not in ("other", "rounding")}
             columns[column.name] = {**values, "classes": list(column.classes)}
         return {**entries, "columns": columns}
 
@@ -254,7 +278,7 @@ class Columns:
         """Return the schema as an editable TOML file."""
         lines = [
             f"{name} = {_quote(value) if isinstance(value, str) else _quote_all(value)}"
-            for name in ("id", "time", "zone", "group", "split", "na_values", "decimal")
+            for name in ("id", "time", "zone", "group", "split", "na_values", "decimal", "calendar")
             if (value := getattr(self, name))
         ]
         for column in self.columns:
@@ -265,6 +289,7 @@ class Columns:
             lines += [f"unit = {_quote(column.unit)}"] if column.unit else []
             lines += [f"classes = {_quote_all(column.classes)}"] if column.classes else []
             lines += [f"other = {_quote(column.other)}"] if column.other else []
+            lines += [f"rounding = {column.rounding!r}"] if column.rounding else []
         return "\n".join(lines).strip() + "\n"
 
     @classmethod
@@ -305,9 +330,12 @@ def layout(schema: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in schema.items():
         many = isinstance(value, list | tuple)
         items = tuple(value) if many else (value,)
-        if (name in ("id", "time", "na_values") and many) or name in ("id", "na_values"):
+        lists = ("id", "na_values", "calendar")
+        if (name == "time" and many) or name in lists:
             if not all(isinstance(item, str) for item in items):
-                expected = 'texts, such as ["?"]' if name == "na_values" else "names of columns"
+                expected = {"na_values": 'texts, such as ["?"]', "calendar": 'features, such as ["weekday"]'}.get(
+                    name, "names of columns"
+                )
                 raise ValueError(f"{name} is {brief(value)}; expected {expected}")
             entries[name] = items
         elif isinstance(value, str | None):

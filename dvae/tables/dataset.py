@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
 from ..options import check, require
+from .advice import is_aligned
 from .ahead import ahead
 from .column_inference import ColumnHints
 from .columns import Columns
@@ -228,11 +229,16 @@ class PanelData:
 
 
 def default_cut(panel: Panel) -> Cut:
-    """Return a default cut: fewer than 10 sequences without a given split are split by time, otherwise by sequence.
+    """Return a default cut; sequences without a given split are split by time if they are few or share their dates.
 
-    The horizon is a tenth of the median length, at most 24 steps, and three times as many steps are observed.
+    Fewer than 10 sequences are few. Sequences with the same dates share events, which a split by sequence reveals. The
+    horizon is a tenth of the median length, at most 24 steps, and three times as many steps are observed.
     """
     lengths = sorted(len(sequence) for sequence in panel.series)
-    is_small = len(panel) < 10 and not any(sequence.split for sequence in panel.series)
     horizon = max(min(lengths[len(lengths) // 2] // 10, 24), 1)
-    return Cut(3 * horizon, horizon, split="time" if is_small else "sequence")
+    by_time = Cut(3 * horizon, horizon, split="time")
+    if any(sequence.split for sequence in panel.series):
+        return replace(by_time, split="sequence")
+    if len(panel) < 10 or (is_aligned(panel) and all(by_time.starts(panel, split) for split in SPLITS)):
+        return by_time
+    return replace(by_time, split="sequence")

@@ -8,6 +8,8 @@
 | d | time since the previous step in median steps, if steps are not evenly spaced | (B, T, 1) |
 | r | logarithm of the level of each count: its mean over earlier observed steps, shrunk to the panel's | (B, T, R) |
 
+c ends with the calendar features of the schema (`Calendar.features`), computed from the times.
+
 A missing entry of a covariate repeats the last value, and its indicator is 0. Before any value, the entry is the mean
 of the training data, or no class for a category. A covariate known up to the present repeats its last value after that.
 """
@@ -28,12 +30,12 @@ from ..data.batch import Batch
 from ..data.schema import Schema, SchemaError
 from ..data.series_units import LOCATION, WINDOWS, SeriesPrior, SeriesUnits
 from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_imprecise
-from ..data.views import ContextView, View, Views
+from ..data.views import ContextView, Dequantised, View, Views
 from ..distributions.base import DistributionSpec
 from ..distributions.family import FAMILIES
 from ..distributions.product import Product
 from ..options import Amount, Positive, Range, require, tuples
-from .calendar import NUMBERS, Calendar
+from .calendar import FEATURES, NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
 from .panel import COUNTS, Panel, Series
 from .protocol import Cut
@@ -103,6 +105,8 @@ class PanelSchema(Schema):
             if covariates:
                 n_indicators = sum(column.name in self.with_missing for column in covariates)
                 sizes[name] = sum(len(column.coordinates) for column in covariates) + n_indicators
+        if self.columns.calendar:
+            sizes[COVARIATES] = sizes.get(COVARIATES, 0) + sum(FEATURES[name] for name in self.columns.calendar)
         if self.step:
             sizes[GAPS] = 1
         if self.counts:
@@ -249,17 +253,20 @@ class PanelSchema(Schema):
     @property
     @override
     def view(self) -> View:
-        """View that offers the context as optional inputs, and changes x to the units of `scaling`."""
-        context = ContextView(tuple(name for name in self.sizes if name != "x"))
-        if self.scaling == "columns":
-            return context
-        lag = {"changes": 1, "seasonal": self.cut.season or 0}.get(self.scaling, 0)
-        priors = [
-            None if column.family in COUNTS else self._prior(column)
-            for column in self.columns.targets
-            for _ in column.coordinates
-        ]
-        return Views(SeriesUnits(tuple(priors), lag, self.cut.observed), context) if any(priors) else context
+        """View that offers the context as optional inputs, and changes x to the units of `scaling`.
+
+        If columns declare a rounding, it first adds noise of this width to x.
+        """
+        columns = [column for column in self.columns.targets for _ in column.coordinates]
+        views: list[View] = [ContextView(tuple(name for name in self.sizes if name != "x"))]
+        priors = tuple(None if column.family in COUNTS else self._prior(column) for column in columns)
+        if any(priors):
+            lag = {"changes": 1, "seasonal": self.cut.season or 0}.get(self.scaling, 0)
+            views.insert(0, SeriesUnits(priors, lag, self.cut.observed))
+        widths = tuple(column.rounding for column in columns)
+        if any(widths):
+            views.insert(0, Dequantised(widths))
+        return Views(*views) if len(views) > 1 else views[0]
 
     @property
     def exposure(self) -> tuple[str, Sequence[int]] | None:
@@ -349,7 +356,11 @@ class PanelSchema(Schema):
 
     def context(self, one: Series) -> np.ndarray:
         """Return c (T, C) of a sequence, with future values of all covariates."""
-        return self._fill(one.values, self.columns.of("known", "past"))
+        parts = [self._fill(one.values, columns)] if (columns := self.columns.of("known", "past")) else []
+        if self.columns.calendar:
+            assert one.times is not None  # checked by the panel
+            parts.append(self.calendar.features(one.times, self.columns.calendar))
+        return np.concatenate(parts, 1)
 
     def static(self, one: Series) -> np.ndarray:
         """Return s (S,) of a sequence.

@@ -195,3 +195,10 @@ def _number(cell: Any, decimal: str) -> float:
 
 def _is_float(text: str) -> bool:
     return not np.isnan(_number(text, "."))
+
+
+def is_multiple(values: np.ndarray, unit: float) -> np.ndarray:
+    """Return whether values are multiples of a unit, up to rounding errors of float32."""
+    multiples = values / unit
+    difference: np.ndarray = np.abs(multiples - np.rint(multiples))
+    return difference <= (1e-6 * np.abs(multiples)).clip(max=0.1)

@@ -31,7 +31,7 @@ from .calendar import NUMBERS, Calendar
 from .clocks import time_of
 from .column_inference import LARGEST, TIMES, ColumnHints, is_date
 from .columns import Column, Columns
-from .numerals import read_numbers
+from .numerals import is_multiple, read_numbers
 from .parsing import is_duration, is_number, numeric, tabular, texts, times
 
 SPLITS = ("train", "validation", "test")
@@ -94,7 +94,7 @@ class Panel:
 
     Raises:
         ValueError: if sequences are empty, have other columns, share a name, are out of order, or have values that are
-            invalid for their column.
+            invalid for their column, or if calendar features lack dates.
     """
 
     series: Sequence[Series]
@@ -106,6 +106,14 @@ class Panel:
     def __post_init__(self) -> None:
         if not self.series:
             raise ValueError(f"{self.name} has no sequences")
+        if self.columns.calendar and (
+            self.calendar.kind != "dates" or any(sequence.times is None for sequence in self.series)
+        ):
+            times = "missing" if any(sequence.times is None for sequence in self.series) else self.calendar.kind
+            raise ValueError(
+                f"calendar is {', '.join(self.columns.calendar)}, but the times of {self.name} are {times}; calendar "
+                "features need dates: name their column as the time, or leave `calendar` out"
+            )
         names: set[str] = set()
         for sequence in self.series:
             label = f"sequence {sequence.name!r} of {self.name}"
@@ -126,9 +134,9 @@ class Panel:
 
     def _check(self) -> frozenset[str]:
         """Check that values are valid for the family of their column; return the names of complete mapped sequences."""
-        kinds: dict[tuple[str, int], list[int]] = {}
+        kinds: dict[tuple[str, int, float], list[int]] = {}
         for index, column in enumerate(self.columns.columns):
-            kinds.setdefault((column.family, len(column.classes)), []).append(index)
+            kinds.setdefault((column.family, len(column.classes), column.rounding), []).append(index)
         ends, start, incomplete = np.cumsum([len(sequence) for sequence in self.series]), 0, set[int]()
         for block in row_blocks(sequence.values for sequence in self.series):
             block = block.astype(np.float64, copy=False)
@@ -142,11 +150,10 @@ class Panel:
                     row, offset = np.argwhere(invalid)[0]
                     owner, column = np.searchsorted(ends, start + row, "right"), self.columns.columns[indices[offset]]
                     sequence, size = self.series[owner], f", below {LARGEST:g} in size" if valid[row, offset] else ""
-                    advice = (
-                        "give it another family" if np.isfinite(cells[row, offset]) else "write NaN for missing values"
-                    )
+                    other = f"give it another family{' or rounding' if column.rounding else ''}"
+                    advice = other if np.isfinite(cells[row, offset]) else "write NaN for missing values"
                     raise ValueError(
-                        f"sequence {sequence.name!r} of {self.name} has {cells[row, offset]:g} in row "
+                        f"sequence {sequence.name!r} of {self.name} has {cells[row, offset]:.9g} in row "
                         f"{start + row - ends[owner] + len(sequence)} of column {column.name!r}, but the family "
                         f"{column.family!r} requires {domain}{size}; {advice}"
                     )
@@ -355,7 +362,10 @@ def _validity_test(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], 
         "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
         "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
     }
-    return tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
+    is_valid, domain = tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
+    if unit := column.rounding:
+        return (lambda v: is_valid(v) & is_multiple(v, unit)), f"{domain} that are multiples of its rounding, {unit:g}"
+    return is_valid, domain
 
 
 def _counts(values: np.ndarray) -> np.ndarray:

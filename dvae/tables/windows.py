@@ -78,6 +78,11 @@ class PanelWindows:
         )
         if not self._ranges:
             raise ValueError(message)
+        if schema.columns.calendar and (panel.calendar.zone is None) != (schema.calendar.zone is None):
+            raise ValueError(
+                f"the dates of {panel.name} have the zone {panel.calendar.zone}, but the zone of the training data is "
+                f"{schema.calendar.zone}; calendar features need both or neither, so name the missing one (--zone)"
+            )
         sequences = [panel.series[index] for index, _, _ in self._ranges]
         lengths = torch.tensor([len(sequence) for sequence in sequences])
         self._first = lengths.cumsum(0) - lengths

@@ -6,7 +6,8 @@ import torch
 
 import dvae
 from dvae.data.batch import Batch
-from dvae.data.views import History, Parts, Past, View, Views
+from dvae.data.views import Dequantised, History, Parts, Past, View, Views
+from dvae.distributions.families import FixedNormal
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.models.motion.trajectories import OtherJoints
 from dvae.motion import HUMANEVA, WALKER, Bones, Heading, rotate_about_up
@@ -475,3 +476,49 @@ def test_a_scaled_model_forecasts_unscaled_data_and_is_fitted_to_their_bound():
     )
     assert fit.best_bound == pytest.approx(plain_fit.best_bound + added)
     assert fit.series("loss")[1] == pytest.approx([loss - added for loss in plain_fit.series("loss")[1]])
+
+
+def constant_model(scale, view=None):
+    """Return x ~ N(0, scale²) at every step, independent of the context."""
+    family = FixedNormal(scale=scale, learned=False)
+    model = dvae.DynamicalVAE("p(x_t | c_t)", None, {"x": 2, "c": 1}, Recurrent(2), family, view=view).double()
+    for parameter in model.parameters():
+        parameter.data.zero_()
+    return model.eval()
+
+
+WIDTHS = (0.5, 0.25)
+
+
+def test_rounding_noise_is_uniform_and_returning_values_are_rounded():
+    view = Dequantised((0.5, 0.0))
+    x = torch.randint(-9, 9, (400, T, 2)).double() / 2
+    viewed = view(Batch(x=x))
+    noise = (viewed["x"] - x)[..., 0]
+    assert noise.abs().max() <= 0.25
+    torch.testing.assert_close(noise.var(), torch.tensor(0.25 / 12).double(), rtol=0.1, atol=0)
+    assert torch.equal(viewed["x"][..., 1], x[..., 1])
+    assert torch.equal(view.inverse(viewed)["x"], x)
+    assert view.inverse(viewed).keys() == {"x"}
+    assert torch.equal(view(viewed)["x"], viewed["x"])  # one noise for each reading
+    assert not torch.equal(view(Batch(x=x))["x"], viewed["x"])
+    with pytest.raises(ValueError, match="rounding noise has 2 widths, but x has size 3"):
+        dvae.DynamicalVAE(*SMALL, Recurrent(4), view=view)
+
+
+@pytest.mark.parametrize("scale", [2.0, 0.3, 0.02, 1e-4])
+def test_a_bound_of_rounded_values_is_at_most_their_exact_probability(scale):
+    """The exact probability is that of the cell of each rounded value; without noise, the density exceeds it."""
+    widths, x = torch.tensor(WIDTHS).double(), torch.tensor([[0.0, 0.25], [0.5, 0.0], [0.0, 0.0]]).double()
+    upper, lower = (torch.special.log_ndtr((sign * widths / 2 - x.abs()) / scale) for sign in (1, -1))
+    exact = (upper + torch.log1p(-(lower - upper).exp())).sum()  # in the left tail, where differences are exact
+    many = Batch(x=x.expand(4000, 3, 2), c=torch.zeros(4000, 3, 1).double())
+    torch.manual_seed(0)
+    bounds = constant_model(scale, Dequantised(WIDTHS)).log_joint(many, {})["x"] + 3 * widths.log().sum()
+    assert bounds.mean() <= exact + 3 * bounds.std() / 4000**0.5
+    zeros = Batch(x=torch.zeros(1, 3, 2).double(), c=many["c"][:1])
+    without_noise = constant_model(scale).log_joint(zeros, {})["x"] + 3 * widths.log().sum()
+    if scale == 2.0:
+        torch.testing.assert_close(bounds.mean(), exact, rtol=0.01, atol=0)
+    if scale < 0.1:
+        assert without_noise > 0  # no probability is that large

@@ -7,7 +7,7 @@ import pytest
 
 from dvae.tables import ColumnHints, Cut, Panel, PanelData, Series
 from dvae.tables.ahead import ahead
-from dvae.tables.calendar import Calendar, seconds
+from dvae.tables.calendar import FEATURES, Calendar, functions_of_time, seconds
 from dvae.tables.columns import Column, Columns
 from dvae.tables.encoding import PanelSchema
 
@@ -166,3 +166,88 @@ def test_a_calendar_is_saved_with_a_run_and_validated():
     for zone, step in (("../../etc/passwd", "1D"), ("dateutil//etc/x", "1D"), ("UTC", "99999D"), ("UTC", "x")):
         with pytest.raises(ValueError, match="expected"):
             PanelSchema.from_config({**data.schema.config(), "calendar": {"kind": "dates", "zone": zone, "step": step}})
+
+
+@pytest.mark.parametrize("zone", ZONES)
+def test_calendar_features_are_local(zone):
+    dates = pd.date_range("2023-01-01", "2024-12-31 23:00", freq="h", tz=zone)
+    features = Calendar("dates", zone).features(seconds(dates), FEATURES)
+    ends = np.cumsum([*FEATURES.values()])
+    hour, weekday, month, day = np.split(features, ends[:-1], axis=1)
+    assert day.shape[1] == FEATURES["day_of_year"]
+    np.testing.assert_array_equal(weekday.argmax(1), dates.day_of_week)
+    np.testing.assert_array_equal(weekday.sum(1), 1)
+    for part, cycle, expected in [(hour, 24, dates.hour), (month, 12, dates.month - 1)]:
+        angle = np.arctan2(part[:, 0], part[:, 2]) % (2 * np.pi)
+        np.testing.assert_allclose(angle, 2 * np.pi * np.asarray(expected) / cycle, atol=1e-9)
+        second = np.arctan2(part[:, 1], part[:, 3])
+        np.testing.assert_allclose(np.exp(1j * second), np.exp(2j * angle), atol=1e-9)
+    steps = np.linalg.norm(np.diff(day[:: 24 * 7], axis=0), axis=1)  # weeks are evenly spaced, also over the new year
+    assert steps.max() < 1.3 * steps.min()
+
+
+def daily(days=120, n=3, start="2024-01-01"):
+    dates = np.tile(pd.date_range(start, periods=days), n)
+    frame = pd.DataFrame({"site": np.repeat([*"abcdef"][:n], days), "date": dates})
+    return frame.assign(y=np.random.default_rng(0).normal(size=len(frame)))
+
+
+def test_calendar_features_continue_beyond_the_table_without_further_rows():
+    frame = daily().assign(z=1.5)
+    hints = ColumnHints(("y",), past=("z",), id=("site",), time="date", calendar=("weekday", "month"))
+    data = PanelData.of(frame, hints, Cut(14, 7, split="time"))
+    assert data.schema.sizes["c"] == 2 + 7 + 4
+    c = data.ahead().all()["c"]
+    following = pd.date_range("2024-01-01", periods=127)[-21:]
+    np.testing.assert_array_equal(c[0, :, 2:9].argmax(1), following.day_of_week)
+    np.testing.assert_allclose(c[0], c[1])
+    whole = PanelSchema.from_config(data.schema.config())
+    assert whole == data.schema
+    np.testing.assert_allclose(whole.context(data.panel.series[0])[-14:, 2:], c[0, :14, 2:], atol=1e-6)
+    fewer = PanelData.of(frame, replace(data.panel.columns, calendar=("weekday",)), data.protocol)
+    assert fewer.windows("test").fingerprint != data.windows("test").fingerprint
+    with pytest.raises(ValueError, match="the zone UTC, but the zone of the training data is None; calendar features"):
+        data.with_data(frame.assign(date=frame.date.dt.tz_localize("UTC"))).windows("test")
+
+
+def test_calendar_features_require_dates():
+    frame = daily().assign(day=lambda each: each.groupby("site").cumcount())
+    with pytest.raises(
+        ValueError, match="calendar is hour, but the times of panel are numbers; calendar features need"
+    ):
+        Panel.of(frame, ColumnHints(("y",), id=("site",), time="day", calendar=("hour",)))
+    with pytest.raises(ValueError, match="calendar is hour, but the times of panel are missing"):
+        Panel.of(np.zeros((2, 5, 1)), Columns((Column("x"),), calendar=("hour",)))
+
+
+def test_functions_of_the_time_are_found_and_others_are_not():
+    frame = daily(days=800, n=2)
+    random, dates = np.random.default_rng(1), frame.date.dt
+    on_day = lambda values: np.tile(values, 2)  # noqa: E731
+    functions = {
+        "weekday": dates.day_of_week,
+        "weekend": dates.day_of_week > 4,
+        "month": dates.month,
+        "day of the month": dates.day < 10,
+        "day_of_year": (dates.month == 12) & (dates.day == 25),
+        "time": dates.year + dates.day_of_year / 365.25,
+        "date": on_day(random.random(800) < 0.1),
+    }
+    others = {
+        "noise": random.normal(size=1600),
+        "flag": random.random(1600) < 0.5,
+        "rare": np.arange(1600) == 700,
+        "price": on_day(random.normal(size=800)),  # equal in all sequences, but not known in the future
+        "trend": np.arange(1600) % 800 + random.normal(0, 20, 1600),
+    }
+    values = {name: np.asarray(each, float) for name, each in (functions | others).items()}
+    values["year"] = np.asarray(dates.year, float)
+    values["weekday"][5:50] = np.nan
+    owners = np.repeat([0, 1], 800)
+    found = functions_of_time(values, seconds(pd.DatetimeIndex(frame.date)), Calendar("dates"), owners)
+    expected = {name: name for name in functions} | {"weekend": "weekday", "year": "time"}
+    assert found == expected
+    single = {name: each[:800] for name, each in values.items()}
+    found = functions_of_time(single, seconds(pd.DatetimeIndex(frame.date[:800])), Calendar("dates"), owners[:800])
+    del expected["date"]  # one sequence does not show that a date determines a value
+    assert found == expected

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from dvae.distributions.family import FAMILIES
 from dvae.tables import Column, Columns
-from dvae.tables.columns import MOST, parsed
+from dvae.tables.calendar import FEATURES
+from dvae.tables.columns import MOST, ROUNDED, parsed
 from dvae.tables.protocol import Cut
 from dvae.tables.reading import read_schema, written_schema
 
@@ -22,7 +23,8 @@ def column(draw, name, role):
     families = list(FAMILIES) if role == "target" else ["real", "category"]
     family = draw(st.sampled_from(families))
     classes = draw(st.lists(NAMES, min_size=2, max_size=4, unique=True)) if family == "category" else ()
-    return Column(name, role, family, draw(NAMES), tuple(classes), draw(st.sampled_from(["", *classes])))
+    rounding = draw(st.sampled_from([0.0, 0.1, 2.5])) if role == "target" and family in ROUNDED else 0.0
+    return Column(name, role, family, draw(NAMES), tuple(classes), draw(st.sampled_from(["", *classes])), rounding)
 
 
 @st.composite
@@ -31,6 +33,7 @@ def schemas(draw):
     special = {"id": (next(names), next(names))[: draw(st.integers(0, 2))]}
     special |= {name: draw(st.none() | st.just(next(names))) for name in ("time", "group", "split")}
     special |= {"zone": draw(st.sampled_from([None, "Europe/Berlin", "+02:00"]))} if special["time"] else {}
+    special |= {"calendar": tuple(draw(st.lists(st.sampled_from([*FEATURES]), unique=True)))}
     roles = ["target", *draw(st.lists(st.sampled_from(["target", "known", "past", "static"]), max_size=3))]
     return Columns(tuple(draw(column(name, role)) for name, role in zip(names, roles, strict=False)), **special)
 
@@ -72,6 +75,15 @@ def test_a_schema_survives_toml_with_its_cut_and_json(columns, cut):
         ("time = 'a'\nzone = 'Berlin'\n[columns.b]", "zone is 'Berlin'; expected a name such as 'Europe/Berlin'"),
         ("zone = 'UTC'\n[columns.b]", "zone is 'UTC', but no column is the time"),
         ("[columns.a]\nfamily = 'category'\nclasses = ['b', 'c']\nother = 'd'", "other = 'd'.* not one of its classes"),
+        ("calendar = ['weekdy']\n[columns.a]", r"weekdy; expected some of hour, .*did you mean 'weekday'"),
+        ("calendar = ['hour', 'hour']\n[columns.a]", "hour, hour; expected some of hour, .* at most once"),
+        ("calendar = [3]\n[columns.a]", r"calendar is \[3\]; expected features, such as"),
+        ("[columns.a]\nfamily = 'count'\nrounding = 1", "rounding = 1, but is a target of family 'count'; rounding is"),
+        (
+            "[columns.a]\n[columns.b]\nrole = 'past'\nrounding = 1",
+            "is a past of family 'real'; rounding is for targets",
+        ),
+        ("[columns.a]\nrounding = -1", "rounding is -1"),
         ("[columns]\na = 3", "column 'a' is 3; expected a table"),
         ("[cut]\nobservd = 3", r"entry 'observd' \(did you mean 'observed'\?\)"),
         ("[cut]\nobserved = 3", "give both, or neither"),
@@ -81,6 +93,15 @@ def test_a_schema_survives_toml_with_its_cut_and_json(columns, cut):
 def test_an_invalid_schema_is_an_error_of_one_sentence(text, message):
     with pytest.raises(ValueError, match=message):
         read_schema(text)
+
+
+def test_default_features_and_rounding_change_no_stored_schema_or_fingerprint():
+    columns = Columns((Column("a"),), time="day")
+    assert columns.config().keys() == {"id", "time", "group", "split", "columns"}
+    assert columns.config()["columns"]["a"].keys() == {"role", "family", "unit", "classes"}
+    other = Columns((Column("a", rounding=0.5),), time="day", calendar=("hour",))
+    assert repr(other) == repr(columns)
+    assert other.config() != columns.config()
 
 
 def test_a_category_has_a_maximal_number_of_classes_and_they_may_contain_dots():

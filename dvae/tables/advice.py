@@ -1,0 +1,198 @@
+"""Find what makes models of a table worse or their bounds dishonest, and name the option that settles it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from .calendar import FEATURES, FLAG, Calendar, functions_of_time
+from .columns import ROUNDED, Column
+from .numerals import is_multiple
+from .panel import Panel, Series
+from .protocol import Cut
+
+SPIKE, REPEATS = 0.05, 20
+"""Share and number of equal values that are a spike; REPEATS is also the minimum number of compared rows."""
+HURDLE = 0.3
+"""Share of equal values above which a column of its own for them is proposed too."""
+ALIGNED = 0.5
+"""Share of the pairs of a sequence and a date that have a row, above which sequences have the same dates."""
+YEARS = (1500, 2500)
+"""Range of whole numbers that are read as years."""
+SAME, SAME_CHANGE = 0.999, 0.95
+"""Rank correlations of values and of changes above which one column is a function of another.
+
+Both are required, since all columns with a trend have similar ranks.
+"""
+CONTRAST = 10.0
+"""Ratio of scales or levels of sequences above which they differ."""
+LONG = 8
+"""Minimum number of values that determine the scale of a sequence."""
+ROWS, COMPARED, COLUMNS = 200_000, 5000, 30
+"""Maximum numbers of rows that are read, and of rows and columns that are compared with each other."""
+
+
+def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
+    """Return sentences about a table, each with the option that settles it.
+
+    Args:
+        panel: the sequences; the first 200,000 rows are read, and 5000 rows of 30 columns compared with each other.
+        cut: how sequences are split and cut.
+        guessed: whether columns and cut are guesses.
+    """
+    count = 1 + int(np.searchsorted(np.cumsum([len(sequence) for sequence in panel]), ROWS))
+    sequences, columns = panel.series[:count], panel.columns.columns
+    values = np.concatenate([np.asarray(sequence.values[:ROWS], np.float64) for sequence in sequences])
+    owners = np.repeat(np.arange(len(sequences)), [len(sequence.values[:ROWS]) for sequence in sequences])
+    times = [sequence.times[:ROWS] for sequence in sequences if sequence.times is not None]
+    dated = _dated(columns, values, np.concatenate(times), panel.calendar, owners, guessed) if times else ()
+    compared = columns[:COLUMNS], values[:COMPARED, :COLUMNS], owners[:COMPARED]
+    return [
+        *_spikes(columns, values),
+        *_split(panel, cut, guessed),
+        *dated,
+        *_leaks(*compared),
+        *_scales(columns, sequences),
+    ]
+
+
+def is_aligned(panel: Panel) -> bool:
+    """Return whether several sequences have nearly the same dates or years."""
+    times = [sequence.times for sequence in panel if sequence.times is not None]
+    if len(times) < max(len(panel), 2):
+        return False
+    joined = np.concatenate(times)
+    is_year = (joined % 1 == 0).all() and YEARS[0] <= joined.min() and joined.max() <= YEARS[1]
+    is_dated = panel.calendar.kind == "dates" or (panel.calendar.kind == "numbers" and is_year)
+    return bool(is_dated and len(joined) > ALIGNED * len(times) * len(np.unique(joined)))
+
+
+def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
+    spikes = []
+    for column, cells in zip(columns, values.T, strict=True):
+        levels, counts = np.unique(cells[~np.isnan(cells)], return_counts=True)
+        if column.role != "target" or column.family not in ROUNDED or column.rounding or not len(levels):
+            continue
+        share, level, unit = counts.max() / counts.sum(), levels[counts.argmax()], _resolution(levels)
+        remedies = [f"rounding = {unit:g}"] if unit else []
+        remedies += ["the family sparse-overdispersed"] if unit == 1 and levels[0] == level == 0 else []
+        remedies += [] if unit and share < HURDLE else ["one binary column for it, and another that is empty there"]
+        if share > SPIKE and counts.max() >= REPEATS:
+            spikes.append(f"{share:.0%} of {column.name!r} are {level:g} ({' or '.join(remedies)})")
+    if spikes:
+        yield (
+            "a continuous density has no bound at a value that occurs often, so bounds can grow without limit; declare "
+            f"what the brackets propose: {', '.join(spikes)}"
+        )
+
+
+def _resolution(levels: np.ndarray) -> float:
+    """Return the largest unit, 1 or 5 times a power of 10, of which all values are multiples; 0 without one."""
+    for unit in (float(f"{digit}e{exponent}") for exponent in range(6, -5, -1) for digit in (5, 1)):
+        if is_multiple(levels, unit).all():
+            return unit
+    return 0.0
+
+
+def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:
+    reason = "a split by sequence would reveal events of the test dates, since all sequences have the same dates"
+    if is_aligned(panel) and not any(sequence.split for sequence in panel):
+        if cut.split == "sequence":
+            yield f'{reason}; set split = "time" in [cut], with observed and horizon (--split time)'
+        elif cut.split == "time" and guessed:
+            yield f'the proposed split is by time: {reason}; split = "sequence" tests new sequences instead'
+
+
+def _dated(
+    columns: Sequence[Column],
+    values: np.ndarray,
+    times: np.ndarray,
+    calendar: Calendar,
+    owners: np.ndarray,
+    guessed: bool,
+) -> Iterator[str]:
+    roles = {column.name: column.role for column in columns if column.role != "static"}
+    cells = {column.name: values[:, index] for index, column in enumerate(columns) if column.name in roles}
+    for name, argument in functions_of_time(cells, times, calendar, owners).items():
+        what = "has one value for each date" if argument == "date" else f"is a function of the {argument}"
+        if roles[name] != "known":
+            yield f"{name!r} {what}; if its future is known, make it known (--covariates {name})"
+        elif argument in FEATURES:
+            yield f'{name!r} {what}; calendar = ["{argument}"] (--calendar {argument}) computes it for any date'
+        elif guessed:
+            yield f"{name!r} {what}, and is guessed as known; if its future is unknown, make it past (--past {name})"
+
+
+def _leaks(columns: Sequence[Column], values: np.ndarray, owners: np.ndarray) -> Iterator[str]:
+    """Yield columns that follow from a target."""
+    import pandas as pd
+
+    table = pd.DataFrame(values)
+    joined = pd.concat([table, table.groupby(owners).diff()], axis=1)
+    ranked, size = joined.corr(method="spearman", min_periods=REPEATS).to_numpy(), len(columns)
+    for a, target in enumerate(columns):
+        for b, other in enumerate(columns):
+            if a == b or target.role != "target" or other.role not in ("target", "known"):
+                continue
+            is_first, text = b > a or other.role == "known", ""
+            if is_first and abs(ranked[a, b]) > SAME and abs(ranked[size + a, size + b]) > SAME_CHANGE:
+                text = f"is a function of {target.name!r} at the same step"
+            elif _is_step(values[:, b], values[:, a]):
+                text = f"is a step function of {target.name!r} at the same step"
+            elif ranked[a, size + b] > SAME:
+                text = f"is a running total of {target.name!r}"
+            elif is_first and (lag := _lag(values[:, a], values[:, b], owners)):
+                text = f"equals {target.name!r} {abs(lag)} steps {'before' if lag > 0 else 'later'}"
+            if text:
+                yield f"{other.name!r} {text}; leave one of them out (--columns), or make it past (--past {other.name})"
+
+
+def _is_step(values: np.ndarray, source: np.ndarray) -> bool:
+    """Return whether each of few values occupies an interval of its own of a source with many."""
+    known = ~(np.isnan(values) | np.isnan(source))
+    order = np.argsort(source[known], kind="stable")
+    values, source = values[known][order], source[known][order]
+    levels, counts = np.unique(values, return_counts=True)
+    if not 2 <= len(levels) <= FLAG or 4 * counts.min() < REPEATS or len(np.unique(source)) <= FLAG:
+        return False
+    changes = values[1:] != values[:-1]
+    return bool(changes.sum() == len(levels) - 1 and (source[1:] > source[:-1])[changes].all())
+
+
+def _lag(source: np.ndarray, values: np.ndarray, owners: np.ndarray) -> int:
+    """Return by how many steps values repeat a source, found by numbers that occur once in it; 0 if they do not."""
+    levels, first, counts = np.unique(source, return_index=True, return_counts=True)
+    place = np.searchsorted(levels, values).clip(max=len(levels) - 1)
+    rows = np.flatnonzero((levels[place] == values) & (counts[place] == 1) & (owners == owners[first[place]]))
+    lags, counts = np.unique(rows - first[place[rows]], return_counts=True)
+    is_copy = len(rows) >= REPEATS and counts.max() > (1 - SPIKE) * len(rows)
+    return int(lags[counts.argmax()]) if is_copy else 0
+
+
+def _scales(columns: Sequence[Column], sequences: Sequence[Series]) -> Iterator[str]:
+    ratios = []
+    for index, column in enumerate(columns):
+        if column.role != "target" or column.family in ("binary", "category", "share", "angle"):
+            continue
+        parts = (np.asarray(one.values[:ROWS, index], np.float64) for one in sequences)
+        cells = [each[~np.isnan(each)] for each in parts]
+        cells = [each for each in cells if len(each) >= LONG]
+        scale = min(_contrast(map(np.std, cells)), _contrast(np.diff(each).std() for each in cells))
+        level = _contrast(map(np.median, cells)) if all((each >= 0).all() for each in cells) else 1.0
+        if (ratio := max(scale, level)) > CONTRAST:
+            fixed = "; the family 'fixed' has one scale for all, so take 'real'" if column.family == "fixed" else ""
+            ratios.append(f"{column.name!r} by a factor of {ratio:.3g}{fixed}")
+    if ratios:
+        yield (
+            f"the scale or level differs between sequences, of {', '.join(ratios)}; one unit for all fits the large "
+            'ones, and level = "series" (--level series) gives each sequence its own'
+        )
+
+
+def _contrast(sizes: Iterable[Any]) -> float:
+    """Return the ratio of the 95 % and 5 % quantiles of the positive sizes."""
+    positive = [size for size in sizes if size > 0]
+    low, high = np.quantile(positive, (0.05, 0.95)) if positive else (1.0, 1.0)
+    return float(high / low)
