@@ -30,7 +30,7 @@ def info(
     """Describe motion files or tables.
 
     For motion, prints splits, clips, skeleton, units, axes, bone lengths and labels. For a table, guesses the type of
-    each column and prints a schema; --out riders.toml writes it to a file that you can edit.
+    each column, names what harms a model, and prints a schema; --out riders.toml writes it to a file that you can edit.
 
     Args:
         files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), "simulated", or tables.

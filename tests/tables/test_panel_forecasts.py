@@ -306,3 +306,34 @@ def test_padding_is_not_filled_and_complete_data_are_an_error(model, data):
     full = PanelData.of(np.random.default_rng(0).normal(size=(6, 12, 1)), ["y"], Cut(5, 3))
     with pytest.raises(ValueError, match="no target is missing in panel"):
         full.whole().impute(model)
+
+
+def test_rounded_values_have_bounded_bounds_and_rounded_forecasts(tmp_path):
+    """A model that learns the repeated value has a density of at most 1 / rounding with noise, and no limit without."""
+    random = np.random.default_rng(0)
+    dates = np.tile(pd.date_range("2024-01-01", periods=60), 6)
+    table = pd.DataFrame({"shop": np.repeat(list("abcdef"), 60), "day": dates, "y": 2.5})
+    table.loc[random.random(360) < 0.1, "y"] = np.nan
+    table.loc[::37, "y"] = 3.0
+    path = tmp_path / "shops.csv"
+    table.to_csv(path, index=False)
+    plain = Columns((Column("y"),), ("shop",), "day", calendar=("weekday",))
+    bounds = {}
+    for name, columns in {"plain": plain, "rounded": plain.but("y", rounding=0.5)}.items():
+        data = PanelData.open(path, columns, Cut(8, 4, split="time"))
+        out = tmp_path / name
+        options = {"steps": 150, "batch_size": 32, "learning_rate": 0.03, "progress": False, "out": out}
+        dvae.fit(dvae.method("autoregressive", width=8), data, **options)
+        run = dvae.load(out)
+        assert run.schema == data.schema
+        test = run.data.windows("test")
+        bounds[name] = dvae.SequenceELBO().terms(run.model, test.all()).bound / test.all()["mask"].sum((1, 2))
+    assert bounds["plain"].mean() > 1
+    assert bounds["rounded"].mean() < -np.log(0.5)
+    forecasts = run.data.ahead().forecast(run.model, samples=50)
+    assert (forecasts.draws % 0.5 == 0).all()
+    assert len(forecasts.keys) == 6  # without appended rows: the weekday continues
+    filled = run.data.whole().impute(run.model, samples=2)
+    values = np.stack([sequence.values for sequence in run.data.panel])
+    known = ~np.isnan(values)
+    np.testing.assert_array_equal(filled.draws[0][known], values[known])
