@@ -87,7 +87,7 @@ class LikelihoodMethod(Method):
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
             an offset: one-step forecasts are sharp, but long forecasts can drift without limit. A smaller share limits
             the drift.
-        scaling: units of the targets of a table in the model; see `dvae.tables.encoding.Scaling`. None: the units whose
+        units: units of a table's targets in the model; see `dvae.tables.encoding.TargetUnits`. None: the units whose
             reference point is closest to the future in training windows (`PanelSchema.preferred`).
         scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
@@ -99,15 +99,15 @@ class LikelihoodMethod(Method):
 
     emission: Literal["fixed", "unit", "normal", "student"] | None = None
     residual: Share = 0.0
-    scaling: Literal["columns", "logs", "series", "changes", "seasonal"] | None = None
+    units: Literal["columns", "logs", "series", "changes", "seasonal"] | None = None
     scheduled_sampling: Share | None = 0.0
 
     @override
     def resolve_defaults(self, data: Any) -> Self:
-        """Return the method with unset `scaling` and `scheduled_sampling` chosen for the data."""
+        """Return the method with unset `units` and `scheduled_sampling` chosen for the data."""
         schema, options = Schema.of(data), dict[str, Any]()
-        if self.scaling is None:
-            options["scaling"] = getattr(schema, "preferred", "columns")
+        if self.units is None:
+            options["units"] = getattr(schema, "preferred", "columns")
         if self.scheduled_sampling is None:
             options["scheduled_sampling"] = float(schema.observed is not None and schema.emission is None)
         return replace(self, **options)
@@ -141,8 +141,8 @@ class LikelihoodMethod(Method):
             kind: class of the model.
             view: view of the model, in place of the data's own.
         """
-        if self.scaling not in (None, "columns"):
-            schema = self._scaled(schema)
+        if self.units not in (None, "columns"):
+            schema = self._in_units(schema)
         generative, inference = self.equations()
         names = {name for part in (generative, inference) for name in (*part.variables, *part.context)}
         if extended:
@@ -160,19 +160,19 @@ class LikelihoodMethod(Method):
             model.standardise(name, coordinates, exposure=schema.exposure if name == WHOLE else None)
         return model
 
-    def _scaled(self, schema: Schema) -> Schema:
-        """Return the schema with the units of `scaling`.
+    def _in_units(self, schema: Schema) -> Schema:
+        """Return the schema with the units of `units`.
 
         Raises:
             SchemaError: if the data are not a table, or its columns do not support these units.
         """
-        if not hasattr(schema, "scaled"):
+        if not hasattr(schema, "in_units"):
             raise SchemaError(
-                f"scaling is {self.scaling!r}, which needs a table, but the data are {schema.kind}; use "
-                'scaling="columns", or wrap the data by dvae.tables.PanelData.of'
+                f"units is {self.units!r}, which needs a table, but the data are {schema.kind}; use "
+                'units="columns", or wrap the data by dvae.tables.PanelData.of'
             )
-        scaled: Schema = schema.scaled(self.scaling or "columns")
-        return scaled
+        result: Schema = schema.in_units(self.units or "columns")
+        return result
 
     def of_columns(self, distribution: DistributionSpec) -> DistributionSpec:
         """Return the distribution of x for a table whose columns define one, with the `residual` of this method.
@@ -288,7 +288,7 @@ def with_residual(distribution: Any, residual: float) -> Any:
     if not hasattr(distribution, "residual") or (isinstance(distribution, Family) and kind != "Laplace"):
         raise ValueError(
             f"residual is {residual}, but {kind} has no location to which the previous value can be added; leave "
-            'residual at 0, give these columns another family, such as real, or use scaling="changes"'
+            'residual at 0, give these columns another family, such as real, or use units="changes"'
         )
     return replace(distribution, residual=residual)
 

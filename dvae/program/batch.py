@@ -91,7 +91,9 @@ class Reader:
             raise ValueError(
                 f"the batch has {', '.join(unknown)}; expected only {', '.join(names)}, 'lengths' and 'mask'"
             )
-        exact = {*wide, whole_name, *self.view.names} if wide or self.view.exact else set()  # the view computes the variables from these
+        exact = (
+            {*wide, whole_name, *self.view.names} if wide or self.view.exact else set()
+        )  # the view computes the variables from these
         values = _tensors(Batch(batch), dtype, names, exact)
         if "mask" in values:
             values["mask"] = values.masks(whole_name)

@@ -23,10 +23,11 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from torch import Tensor
 from typing_extensions import override
 
-from ..data.blocks import ColumnSummary, blocks, row_blocks
 from ..data.batch import Batch
+from ..data.blocks import ColumnSummary, blocks, row_blocks
 from ..data.schema import Schema, SchemaError
 from ..data.series_units import LOCATION, WINDOWS, SeriesPrior, SeriesUnits
 from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_imprecise
@@ -51,13 +52,13 @@ POSITIVE = ("positive", "log-normal")
 LOGARITHMIC = (*POSITIVE, "power")
 """Families whose logarithms networks read."""
 SCALED = (*LOGARITHMIC, *COUNTS)
-Scaling = Literal["columns", "logs", "series", "changes", "seasonal"]
+TargetUnits = Literal["columns", "logs", "series", "changes", "seasonal"]
 """Units of the targets in a model.
 
-"columns": mean and scale of each column. "logs": the same, for logarithms of positive data. "series": level and scale of
-each sequence. "changes": changes since the last value, and "seasonal": since the same step of the last season, relative
-to their mean and scale in the sequence (`dvae.data.series_units`). The last three use logarithms of positive data, and
-the level of a sequence as a known factor of its counts.
+"columns": mean and scale of each column. "logs": the same, for logarithms of positive data. "series": level and scale
+of each sequence. "changes": changes since the last value, and "seasonal": since the same step of the last season,
+relative to their mean and scale in the sequence (`dvae.data.series_units`). The last three use logarithms of positive
+data, and the level of a sequence as a known factor of its counts.
 """
 FIXED = 1e12
 """Weight of a prior that observations do not change."""
@@ -78,7 +79,7 @@ class PanelSchema(Schema):
         step: median time between steps; 0 if steps are evenly spaced.
         calendar: kind, time zone and calendar step of the times.
         priors: dictionary from column to the prior of its level and scale by lag, `SeriesPrior` as a tuple.
-        scaling: units of the targets in a model.
+        target_units: units of the targets in a model.
         preferred: units whose reference point is closest to the future in training windows: the mean of the column, the
             mean of the sequence, its last value or its last season; the default of methods.
     """
@@ -95,8 +96,8 @@ class PanelSchema(Schema):
     step: Amount = 0.0
     calendar: Calendar = NUMBERS
     priors: Mapping[str, Mapping[str, tuple[float, ...]]] = field(default_factory=dict)
-    scaling: Scaling = "columns"
-    preferred: Scaling = "columns"
+    target_units: TargetUnits = "columns"
+    preferred: TargetUnits = "columns"
 
     def __post_init__(self) -> None:
         sizes = {"x": len(self.coordinates)}
@@ -198,19 +199,19 @@ class PanelSchema(Schema):
         """Names of the coordinates of x."""
         return [name for column in self.columns.targets for name in column.coordinates]
 
-    def scaled(self, scaling: str) -> Self:
-        """Return the schema with other units of the targets; see `Scaling`.
+    def in_units(self, target_units: str) -> Self:
+        """Return the schema with other units of the targets; see `TargetUnits`.
 
         Raises:
             SchemaError: if no prior of level and scale is known for these units.
         """
-        require(Scaling, scaling=scaling)
-        schema = replace(self, scaling=scaling)
-        if scaling != "columns" and not any(schema._prior(column) for column in self.columns.targets):
+        require(TargetUnits, target_units=target_units)
+        schema = replace(self, target_units=target_units)
+        if target_units != "columns" and not any(schema._prior(column) for column in self.columns.targets):
             names = ", ".join(f"{column.name} ({column.family})" for column in self.columns.targets)
             raise SchemaError(
-                f"scaling={scaling!r} needs a column of numbers or counts whose training windows have at least 3 "
-                f"values{', and a season of the cut' if scaling == 'seasonal' else ''}; got {names}"
+                f"units={target_units!r} needs a column of numbers or counts whose training windows have at least 3 "
+                f"values{', and a season of the cut' if target_units == 'seasonal' else ''}; got {names}"
             )
         return schema
 
@@ -226,12 +227,12 @@ class PanelSchema(Schema):
     def _prior(self, column: Column) -> SeriesPrior | None:
         """Return the prior of level and scale of a column in these units; None for a column without."""
         lags = {"columns": "", "logs": "0", "series": "0", "changes": "1", "seasonal": str(self.cut.season)}
-        lag = "0" if column.family in COUNTS and self.exposure else lags[self.scaling]
+        lag = "0" if column.family in COUNTS and self.exposure else lags[self.target_units]
         values = self.priors.get(column.name, {}).get(lag)
-        if values is None or (self.scaling == "logs" and column.family not in POSITIVE):
+        if values is None or (self.target_units == "logs" and column.family not in POSITIVE):
             return None
         prior = SeriesPrior(*values[:-1], bool(values[-1]))
-        if self.scaling == "logs":
+        if self.target_units == "logs":
             return prior._replace(mean=prior.level, weight=FIXED, variance=prior.spread**2, freedom=FIXED)
         return prior
 
@@ -253,7 +254,7 @@ class PanelSchema(Schema):
     @property
     @override
     def view(self) -> View:
-        """View that offers the context as optional inputs, and changes x to the units of `scaling`.
+        """View that offers the context as optional inputs, and changes x to the units of `target_units`.
 
         If columns declare a rounding, it first adds noise of this width to x.
         """
@@ -261,7 +262,7 @@ class PanelSchema(Schema):
         views: list[View] = [ContextView(tuple(name for name in self.sizes if name != "x"))]
         priors = tuple(None if column.family in COUNTS else self._prior(column) for column in columns)
         if any(priors):
-            lag = {"changes": 1, "seasonal": self.cut.season or 0}.get(self.scaling, 0)
+            lag = {"changes": 1, "seasonal": self.cut.season or 0}.get(self.target_units, 0)
             views.insert(0, SeriesUnits(priors, lag, self.cut.observed))
         widths = tuple(column.rounding for column in columns)
         if any(widths):
@@ -271,7 +272,7 @@ class PanelSchema(Schema):
     @property
     def exposure(self) -> tuple[str, Sequence[int]] | None:
         """Name of the logarithms of the levels of counts, and the indices of these counts in x; None if not used."""
-        return (LEVELS_OF_COUNTS, self.counts) if self.counts and self.scaling not in ("columns", "logs") else None
+        return (LEVELS_OF_COUNTS, self.counts) if self.counts and self.target_units not in ("columns", "logs") else None
 
     @property
     @override
@@ -328,7 +329,10 @@ class PanelSchema(Schema):
         if not self.exposure:
             return {"x": coordinates}
         levels = [coordinates[n] for n in self.counts]
-        return {"x": coordinates, LEVELS_OF_COUNTS: [Coordinate(each.level, each.spread, each.level) for each in levels]}
+        return {
+            "x": coordinates,
+            LEVELS_OF_COUNTS: [Coordinate(each.level, each.spread, each.level) for each in levels],
+        }
 
     def _relative_units(self, column: Column, prior: SeriesPrior) -> Coordinate:
         """Return units of values that are relative to their sequence; networks read logarithms of counts."""
@@ -432,7 +436,7 @@ class PanelSchema(Schema):
         entries: dict[str, Any] = {name: dict(getattr(self, name)) for name in ("means", "scales", "logarithms")}
         entries |= {"with_missing": list(self.with_missing), "step": self.step, "calendar": asdict(self.calendar)}
         entries["priors"] = {name: {lag: list(each) for lag, each in by.items()} for name, by in self.priors.items()}
-        entries |= {n: v for n in ("scaling", "preferred") if (v := getattr(self, n)) != "columns"}
+        entries |= {n: v for n in ("target_units", "preferred") if (v := getattr(self, n)) != "columns"}
         return {"columns": self.columns.config(), "cut": asdict(self.cut), **entries}
 
     @classmethod

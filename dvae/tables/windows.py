@@ -219,7 +219,9 @@ class PanelWindows:
     def fingerprint(self) -> str:
         """SHA-256 of the data, their cut, and the split."""
         schema = {
-            name: value for name, value in self.schema.config().items() if name not in ("calendar", "priors", "preferred")
+            name: value
+            for name, value in self.schema.config().items()
+            if name not in ("calendar", "priors", "preferred")
         }  # these do not affect x
         digest = hashlib.sha256(f"{self.panel.fingerprint()}({schema!r}, {self.split!r}, ".encode())
         hash_list(digest, self._keys())

@@ -68,13 +68,13 @@ def test_priors_come_from_training_sequences_and_survive_the_configuration(data)
     factors = np.array([50, 50, 1, 50, 50])
     others = [s if s.name in training else replace(s, values=s.values * factors) for s in data.panel]
     assert PanelSchema.from_data(replace(data.panel, series=others), CUT).priors == schema.priors
-    for scaling in ("columns", "logs", "series", "changes", "seasonal"):
-        scaled = schema.scaled(scaling)
+    for units in ("columns", "logs", "series", "changes", "seasonal"):
+        scaled = schema.in_units(units)
         assert PanelSchema.from_config(json.loads(json.dumps(scaled.config()))) == scaled
-    assert "scaling" not in schema.config()
+    assert "target_units" not in schema.config()
     old = {name: value for name, value in schema.config().items() if name != "priors"}
-    with pytest.raises(SchemaError, match="scaling='series' needs a column of numbers or counts"):
-        PanelSchema.from_config(old).scaled("series")
+    with pytest.raises(SchemaError, match="units='series' needs a column of numbers or counts"):
+        PanelSchema.from_config(old).in_units("series")
 
 
 def test_levels_of_counts_use_earlier_observed_steps_alone(data):
@@ -90,8 +90,8 @@ def test_levels_of_counts_use_earlier_observed_steps_alone(data):
 
 
 def test_an_exposure_multiplies_the_mean_of_counts_alone(data):
-    schema = data.schema.scaled("series")
-    model = dvae.method("autoregressive", width=4, scaling="series").build(data.schema).double()
+    schema = data.schema.in_units("series")
+    model = dvae.method("autoregressive", width=4, units="series").build(data.schema).double()
     batch = data.windows("test").all().map(lambda value: value.double() if value.is_floating_point() else value)
     doubled = Batch(batch | {"r": batch["r"] + np.log(2.0)})
     read, factor = model.read(batch), model.generator["x"]
@@ -110,7 +110,7 @@ def test_an_exposure_multiplies_the_mean_of_counts_alone(data):
 
 
 def test_steps_and_the_vectorised_program_agree_with_an_exposure(data):
-    model = dvae.method("srnn", latent=2, width=4, warm_up=1, scaling="series").build(data.schema).double()
+    model = dvae.method("srnn", latent=2, width=4, warm_up=1, units="series").build(data.schema).double()
     complete = PanelData("memory", panel(missing=False), data.schema)
     batch = complete.windows("test").all()
     torch.manual_seed(0)
@@ -140,10 +140,10 @@ def test_an_exposure_must_be_context_of_the_factor():
         model.standardise("x", exposure=("r", [0]))
 
 
-@pytest.mark.parametrize("scaling", ["logs", "series", "changes", "seasonal"])
+@pytest.mark.parametrize("units", ["logs", "series", "changes", "seasonal"])
 @pytest.mark.parametrize("name", ["srnn", "autoregressive", "vae"])
-def test_methods_forecast_impute_and_score_tables_in_these_units(data, name, scaling):
-    options = {"width": 4, "scaling": scaling} | ({} if name == "autoregressive" else {"latent": 2, "warm_up": 1})
+def test_methods_forecast_impute_and_score_tables_in_these_units(data, name, units):
+    options = {"width": 4, "units": units} | ({} if name == "autoregressive" else {"latent": 2, "warm_up": 1})
     if name == "vae":
         del options["width"]
     model = dvae.fit(dvae.method(name, **options), data, steps=2, progress=False).model
@@ -169,7 +169,7 @@ def test_runs_store_the_units(data, tmp_path):
     path.write_text("\n".join(["id,t,riders,price,open,warmth,plan", *rows]))
     columns = replace(COLUMNS, id=("id",), time="t")
     opened = PanelData.open(path, columns, CUT)
-    method = dvae.method("srnn", latent=2, width=4, warm_up=1, scaling="changes")
+    method = dvae.method("srnn", latent=2, width=4, warm_up=1, units="changes")
     fit = dvae.fit(method, opened, steps=2, progress=False, out=tmp_path / "run")
     loaded = dvae.load(tmp_path / "run")
     windows = opened.windows("test")
@@ -196,8 +196,8 @@ def test_residual_means_of_tables_add_the_previous_value():
 
 def test_units_of_sequences_need_a_table_with_numbers():
     with pytest.raises(SchemaError, match="which needs a table, but the data are sequences"):
-        dvae.method("autoregressive", scaling="series").build({"x": 2})
+        dvae.method("autoregressive", units="series").build({"x": 2})
     classes = Panel([Series(str(n), np.eye(9)[:, :1]) for n in range(6)], Columns((Column("a", family="binary"),)))
     schema = PanelSchema.from_data(classes, Cut(4, 2))
     with pytest.raises(SchemaError, match="needs a column of numbers or counts"):
-        schema.scaled("series")
+        schema.in_units("series")
