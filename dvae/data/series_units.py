@@ -1,21 +1,24 @@
 """View of each sequence relative to its own level and scale, which are estimated from its earlier values.
 
-    u_t = f(x_t) - f(x_{t-L})          L = 0: u_t = f(x_t); f: the identity, or the logarithm of positive data
+    u_t = f(x_t) - b_t                 f: the identity, or the logarithm of positive data
     y_t = (u_t - m_t) / s_t            the model's x
 
-m_t and s_t are the location and scale of the one-step prediction of u_t under a normal distribution with unknown mean
-and variance, given u_1, ..., u_{t-1} (Gelman et al., Bayesian Data Analysis, 2013, section 3.3):
+The base b_t is 0 for L = 0, the last value f(x_{t-1}) for L = 1, and for a season of L > 1 steps the mean of
+f(x_{t-L}), f(x_{t-2L}), ... m_t and s_t are the location and scale of the one-step prediction of u_t under a normal
+distribution with unknown mean and variance, given u_1, ..., u_{t-1} (Gelman et al., Bayesian Data Analysis, 2013,
+section 3.3):
 
     m_t = (k m + sum u) / (k + n)      s_t^2 = v_t (1 + 1 / (k + n))
     v_t = (d v + S + k n / (k + n) (mean u - m)^2) / (d + n)
 
 n is the number of earlier values and S the sum of their squares about their mean. The prior (m, k, v, d) is estimated
-from training sequences. After `observed` steps, m_t and s_t no longer change, as in RevIN (Kim et al., 2022), so a
-forecast has one level and one scale.
+from training sequences. After `observed` steps, m_t, s_t and the means of seasons no longer change, as in RevIN (Kim et
+al., 2022), so a forecast has one level and one scale. A value without a base is standardised by the mean and standard
+deviation of f(x) in the training data.
 
 The map is triangular with diagonal f'(x_t) / s_t, so densities and bounds of a model with this view are densities of
-the data. L = 1 makes the mean of a forecast the last value plus what the model adds, and L = a season the seasonal
-naive forecast plus what the model adds.
+the data. With L = 1, the mean of a forecast is the last value plus what the model adds; with a season, it is the mean
+of earlier seasons plus what the model adds.
 """
 
 from __future__ import annotations
@@ -75,10 +78,8 @@ class SeriesPrior(NamedTuple):
         """
         values = [np.log(x) if logarithm else np.asarray(x, np.float64) for x in sequences]
         level, spread = np.nanmean(np.concatenate(values)), np.nanstd(np.concatenate(values))
-        differences = [x[lag:] - x[: len(x) - lag] if lag else x for x in values]
-        windows = [u[n : n + (steps or len(u))] for u in differences for n in range(0, len(u), steps or max(len(u), 1))]
-        windows = windows[:: -(-len(windows) // WINDOWS) or 1]
-        windows = [u[~np.isnan(u)] for u in windows]
+        windows = [x[n : n + (steps or len(x))] for x in values for n in range(0, len(x), steps or max(len(x), 1))]
+        windows = [_relative(x, lag) for x in windows[:: -(-len(windows) // WINDOWS) or 1]]
         several = [u for u in windows if len(u) > 2] or [np.concatenate([*windows, np.zeros(3)])]
         means, variances = np.array([u.mean() for u in several]), np.array([u.var(ddof=1) for u in several])
         degrees = np.array([len(u) - 1.0 for u in several])
@@ -94,6 +95,16 @@ class SeriesPrior(NamedTuple):
             spread=float(spread) or 1.0,
             logarithm=logarithm,
         )
+
+
+def _relative(x: np.ndarray, lag: int) -> np.ndarray:
+    """Return u_t for the steps of f(x) (T,) that have a base, without missing values."""
+    z = torch.from_numpy(x)[None, :, None]
+    base, count, present = torch.zeros_like(z), torch.ones_like(z), ~z.isnan()
+    if lag:
+        base, count, _ = _last_values(z, present) if lag == 1 else _means_by_phase(z, present, lag)
+    u: np.ndarray = (z - base)[present & (count > 0)].numpy()
+    return u
 
 
 def _inverse_chi_square(variances: np.ndarray, degrees: np.ndarray, within: float) -> tuple[float, float]:
@@ -120,8 +131,8 @@ class SeriesUnits(View):
     """Values of each sequence relative to its own level and scale; the module docstring gives the equations.
 
     A forecast from fewer than `observed` steps keeps the level and scale of its last step. The state that continues a
-    sequence has 3 + 2 L rows: count, sum and sum of squares of u - m; then, for each of the next L steps, whether an
-    earlier value was observed; then this value.
+    sequence has 3 + 2 L rows: count, sum and sum of squares of u - m; then, for each of the next L steps, the number of
+    values in its base; then these bases.
 
     Args:
         priors: prior of each coordinate of x; None for a coordinate that the view does not change.
@@ -202,119 +213,119 @@ class SeriesUnits(View):
 
     def _units(self, data: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Return location and scale (B, T, D) of each step, and the state (B, R, D) after the last step."""
-        z, mask, lag = self._transform(data), data.mask(), self.lag
+        z, mask = self._transform(data), data.mask()
         steps, constants = z.shape[1], self._constants(z)
         present = torch.ones_like(z, dtype=torch.bool) if mask is None else mask
-        base, has, last = torch.zeros_like(z), torch.ones_like(present), z[:, :0]
-        if lag:
-            base, has, last = self._bases(z, present, constants["level"])
-        counted = present & has
+        adapts = (torch.arange(steps, device=z.device) < (steps if self.observed is None else self.observed))[:, None]
+        base, count = torch.zeros_like(z), torch.ones_like(z)
+        following = z[:, :0]
+        if self.lag == 1:
+            base, count, following = _last_values(z, present)
+        elif self.lag:
+            base, count, following = _means_by_phase(z, present & adapts, self.lag)
+        counted = present & adapts & (count > 0)
         deviation = torch.where(counted, z - base - constants["mean"], 0.0)
         sums = torch.stack([counted.double(), deviation, deviation.square()], 1).cumsum(2)
-        sums = torch.cat([torch.zeros_like(sums[:, :, :1]), sums], 2)  # entry t: the sums over the first t steps
-        sums = sums[:, :, : None if self.observed is None else self.observed + 1]
-        place = torch.arange(steps, device=z.device).clamp(max=sums.shape[2] - 1)
-        location, scale = self._predict(sums[:, :, place].unbind(1), base, has, constants)
-        return location, scale, torch.cat([sums[:, :, -1], last], 1)
-
-    def _bases(self, z: Tensor, present: Tensor, level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return x_{t-L} (B, T, D), or if it is missing the latest value a multiple of L steps earlier, else the level.
-
-        Also returns where there is such a value, and the rows of the state: for the next L steps, first where there is
-        an earlier value and then the value.
-        """
-        lag, steps = self.lag, z.shape[1]
-        more = -steps % lag  # steps that complete the last period
-
-        def by_period(values: Tensor) -> Tensor:
-            return torch.cat([values, values[:, :1].expand(-1, more, -1)], 1).unflatten(1, (-1, lag))
-
-        present = torch.cat([present, torch.zeros_like(present[:, :1]).expand(-1, more, -1)], 1).unflatten(1, (-1, lag))
-        periods = torch.arange(present.shape[1], device=z.device)[:, None, None]
-        latest = torch.where(present, periods, -1).cummax(1).values  # period of the latest value at each phase
-        latest = torch.cat([torch.full_like(latest[:, :1], -1), latest], 1)
-        values = torch.where(latest >= 0, by_period(z).gather(1, latest.clamp(min=0)), level)
-        has, base = ((each[:, :-1].flatten(1, 2)[:, :steps]) for each in (latest >= 0, values))
-        following = [each[:, -1].roll(more, 1) for each in (latest >= 0, values)]
-        return base, has, torch.cat([following[0].double(), following[1]], 1)
+        earlier = torch.cat([torch.zeros_like(sums[:, :, :1]), sums[:, :, :-1]], 2)
+        location, scale = self._predict(earlier.unbind(1), base, count, constants)
+        return location, scale, torch.cat([sums[:, :, -1], following], 1)
 
     def _predict(
-        self, sums: Sequence[Tensor], base: Tensor, has: Tensor, constants: Mapping[str, Tensor]
+        self, sums: Sequence[Tensor], base: Tensor, count: Tensor, constants: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return location and scale of f(x_t) from the count, the sum and the sum of squares of u - m.
+        """Return location and scale of f(x_t).
 
         Args:
-            sums: sums over earlier steps (..., D).
-            base: f(x_{t-L}) (..., D).
-            has: whether there is such a value.
+            sums: count, sum and sum of squares of u - m over earlier steps (..., D).
+            base: b_t (..., D).
+            count: number of values in the base (..., D); 0 if there is none.
             constants: result of `_constants`.
         """
-        count, total, squares = sums
-        weight = constants["weight"] + count
+        number, total, squares = sums
+        weight = constants["weight"] + number
         variance = constants["freedom"] * constants["variance"] + squares - total.square() / weight
-        variance = (variance / (constants["freedom"] + count)).clamp(min=1e-36)
-        location = torch.where(has, base + constants["mean"] + total / weight, constants["level"])
-        scale = torch.where(has, (variance * (1 + 1 / weight)).sqrt(), constants["spread"])
+        variance = (variance / (constants["freedom"] + number)).clamp(min=1e-36)
+        location = torch.where(count > 0, base + constants["mean"] + total / weight, constants["level"])
+        scale = torch.where(count > 0, (variance * (1 + 1 / weight)).sqrt(), constants["spread"])
         changed = constants["changed"]
         return torch.where(changed, location, 0.0), torch.where(changed, scale, 1.0)
 
     def _following(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return base, location and scale (..., B, L, D) of the L steps after a state; one step if L is 0."""
-        lag = self.lag
-        if lag:
-            has, base = state[..., 3 : 3 + lag, :] > 0, state[..., 3 + lag :, :]
-        else:
-            base = torch.zeros_like(state[..., :1, :])
-            has = torch.ones_like(base, dtype=torch.bool)
+        """Return base, location and scale (..., B, P, D) of the P = max(L, 1) steps after a state."""
+        count, base = torch.ones_like(state[..., :1, :]), torch.zeros_like(state[..., :1, :])
+        if self.lag:
+            count, base = state[..., 3:, :].chunk(2, -2)
         sums = [each[..., None, :] for each in state[..., :3, :].unbind(-2)]
-        return base, *self._predict(sums, base, has, self._constants(state))
+        return base, *self._predict(sums, base, count, self._constants(state))
 
     def _frozen(self, z: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return location and scale of known values z (B, H, D) after a state, which does not change."""
-        _, first, scale = self._following(state)
-        if not self.lag:
-            return first.expand_as(z), scale.expand_as(z)
-        lag, horizon, constants = self.lag, z.shape[1], self._constants(z)
-        sums = [each[:, None] for each in state[:, :3].unbind(1)]
-        has = torch.ones_like(z, dtype=torch.bool)
-        later = self._predict(sums, torch.cat([z[:, :lag], z], 1)[:, :horizon], has, constants)
-        location, scale = (
-            torch.cat([start, rest[:, lag:]], 1)[:, :horizon]
-            for start, rest in zip((first, scale), (later[0], later[1].expand_as(z)), strict=True)
-        )
-        return location, scale
+        _, location, scale = self._following(state)
+        phase = torch.arange(z.shape[1], device=z.device) % location.shape[1]
+        location, scale = location[:, phase], scale[:, phase]
+        if self.lag != 1 or z.shape[1] == 1:
+            return location, scale
+        sums, one = [each[:, None] for each in state[:, :3].unbind(1)], torch.ones_like(z[:, 1:])
+        later = self._predict(sums, z[:, :-1], one, self._constants(z))
+        return tuple(torch.cat([first[:, :1], rest], 1) for first, rest in zip((location, scale), later, strict=True))  # type: ignore[return-value]
 
     def _continue(self, y: Tensor, state: Tensor) -> Tensor:
-        """Return f(x) (..., B, H, D) after a state (B, R, D); later steps read the earlier ones."""
+        """Return f(x) (..., B, H, D) after a state (B, R, D); with L = 1, later steps read the earlier ones."""
         _, location, scale = self._following(state)
-        if not self.lag:
-            return location + scale * y
-        lag, horizon, constants = self.lag, y.shape[-2], self._constants(y)
-        more = -horizon % lag
-        y = torch.cat([y, torch.zeros_like(y[..., :1, :]).expand(*y.shape[:-2], more, -1)], -2).double()
-        y = y.unflatten(-2, (-1, lag))
-        first = location + scale * y[..., 0, :, :]
+        if self.lag != 1:
+            phase = torch.arange(y.shape[-2], device=y.device) % location.shape[-2]
+            return location[..., phase, :] + scale[..., phase, :] * y
+        first = location + scale * y[..., :1, :]
         sums = [each[:, None] for each in state[:, :3].unbind(1)]
-        has = torch.ones_like(first, dtype=torch.bool)
-        mean, scale = self._predict(sums, torch.zeros_like(first), has, constants)
-        z = torch.cat([first[..., None, :, :], mean[..., None, :, :] + scale[..., None, :, :] * y[..., 1:, :, :]], -3)
-        z = torch.where(constants["changed"], z.cumsum(-3), z)
-        return z.flatten(-3, -2)[..., :horizon, :]
+        constants = self._constants(y)
+        mean, scale = self._predict(sums, torch.zeros_like(first), torch.ones_like(first), constants)
+        z = torch.cat([first, mean + scale * y[..., 1:, :]], -2)
+        return torch.where(constants["changed"], z.cumsum(-2), z)
 
     def _generate(self, y: Tensor) -> Tensor:
         """Return f(x) (..., T, D) of sequences from their first step on."""
-        lag, constants, values = self.lag, self._constants(y), []
+        lag, constants, values = self.lag, self._constants(y), list[Tensor]()
         state = y.new_zeros(*y.shape[:-2], 3 + 2 * lag, y.shape[-1], dtype=torch.float64)
-        state[..., 3 + lag :, :] = constants["level"]
         for t, each in enumerate(y.double().unbind(-2)):
             base, location, scale = (part[..., 0, :] for part in self._following(state))
             values.append(location + scale * each)
-            deviation = values[-1] - base - constants["mean"]
+            deviation, adapts = values[-1] - base - constants["mean"], self.observed is None or t < self.observed
             state = state.clone()
-            if t >= lag and (self.observed is None or t < self.observed):
+            if adapts and t >= lag:
                 state[..., :3, :] += torch.stack([torch.ones_like(deviation), deviation, deviation.square()], -2)
-            if lag:
-                value, one = values[-1][..., None, :], torch.ones_like(deviation)[..., None, :]
-                rows = [state[..., :3, :], state[..., 4 : 3 + lag, :], one, state[..., 4 + lag :, :], value]
-                state = torch.cat(rows, -2)
+            if lag == 1:
+                state[..., 3, :], state[..., 4, :] = 1, values[-1]
+            elif lag:
+                counts, means = state[..., 3:, :].clone().chunk(2, -2)
+                if adapts:
+                    counts[..., 0, :] += 1
+                    means[..., 0, :] += (values[-1] - means[..., 0, :]) / counts[..., 0, :]
+                state = torch.cat([state[..., :3, :], counts.roll(-1, -2), means.roll(-1, -2)], -2)
         return torch.stack(values, -2)
+
+
+def _last_values(z: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the last value before each step (B, T, D), whether there is one, and both after the end (B, 2, D)."""
+    index = torch.where(present, torch.arange(z.shape[1], device=z.device)[:, None], -1).cummax(1).values
+    values, exists = z.gather(1, index.clamp(min=0)), (index >= 0).double()
+    before, existed = (torch.cat([torch.zeros_like(each[:, :1]), each[:, :-1]], 1) for each in (values, exists))
+    return before, existed, torch.stack([exists[:, -1], values[:, -1]], 1)
+
+
+def _means_by_phase(z: Tensor, present: Tensor, lag: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean of z_{t-L}, z_{t-2L}, ... for each step (B, T, D), their number, and both for the next L steps.
+
+    Args:
+        z: values (B, T, D).
+        present: whether each value counts.
+        lag: L.
+    """
+    steps = z.shape[1]
+    more = -steps % lag  # steps that complete the last period
+    values = torch.stack([present.double(), torch.where(present, z, 0.0)])
+    values = torch.cat([values, torch.zeros_like(values[:, :, :1]).expand(-1, -1, more, -1)], 2).unflatten(2, (-1, lag))
+    sums = torch.cat([torch.zeros_like(values[:, :, :1]), values.cumsum(2)], 2)  # entry p: the sums before period p
+    count, total = sums
+    mean = total / count.clamp(min=1)
+    before, number = (each[:, :-1].flatten(1, 2)[:, :steps] for each in (mean, count))
+    return before, number, torch.cat([each[:, -1].roll(more, 1) for each in (count, mean)], 1)

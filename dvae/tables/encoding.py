@@ -56,9 +56,9 @@ TargetUnits = Literal["columns", "logs", "series", "changes", "seasonal"]
 """Units of the targets in a model.
 
 "columns": mean and scale of each column. "logs": the same, for logarithms of positive data. "series": level and scale
-of each sequence. "changes": changes since the last value, and "seasonal": since the same step of the last season,
-relative to their mean and scale in the sequence (`dvae.data.series_units`). The last three use logarithms of positive
-data, and the level of a sequence as a known factor of its counts.
+of each sequence. "changes": changes since the last value. "seasonal": differences from the mean of the same step in
+earlier seasons. Both are relative to their mean and scale in the sequence (`dvae.data.series_units`). The last three use
+logarithms of positive data, and the level of a sequence as a known factor of its counts.
 """
 FIXED = 1e12
 """Weight of a prior that observations do not change."""
@@ -81,7 +81,7 @@ class PanelSchema(Schema):
         priors: dictionary from column to the prior of its level and scale by lag, `SeriesPrior` as a tuple.
         target_units: units of the targets in a model.
         preferred: units whose reference point is closest to the future in training windows: the mean of the column, the
-            mean of the sequence, its last value or its last season; the default of methods.
+            mean of the sequence, its last value or the mean of its seasons; the default of methods.
     """
 
     kind: ClassVar[str] = "panel"
@@ -495,7 +495,9 @@ def _prefer(columns: Columns, training: Sequence[np.ndarray], cut: Cut) -> str:
         last = np.ma.array(np.take_along_axis(x, present.clip(0), 1), mask=present < 0)
         points = {"columns": past.mean(), "series": past.mean(1, keepdims=True), "changes": last}
         if cut.season:
-            points["seasonal"] = past[:, -cut.season :][:, np.arange(cut.horizon) % cut.season]
+            phase = (np.arange(cut.observed), cut.observed + np.arange(cut.horizon))
+            means = [past[:, phase[0] % cut.season == p].mean(1) for p in range(cut.season)]
+            points["seasonal"] = np.ma.stack(means, 1)[:, phase[1] % cut.season]
         errors = {name: float(np.ma.filled(abs(future - point).mean(), np.inf)) for name, point in points.items()}
         least = min(errors.values()) or 1.0
         for name, error in errors.items():

@@ -104,7 +104,7 @@ def test_a_lag_above_the_observed_steps_is_refused():
         SeriesUnits((REAL,), 7, 5)
 
 
-@pytest.mark.parametrize("lag", [0, 1, 4])
+@pytest.mark.parametrize("lag", [0, 1])
 def test_the_prior_is_recovered_from_simulated_sequences(lag):
     random = np.random.default_rng(1)
     freedom, variance, weight, mean = 8.0, 0.25, 0.1, 1.5
@@ -153,15 +153,14 @@ def test_the_bound_is_the_density_of_the_data_of_an_equal_model_without_the_view
     x = torch.from_numpy(np.exp(z) if logarithm else z)[None, :, None]
     density, future = -z.sum() if logarithm else 0.0, -z[6:].sum() if logarithm else 0.0
     for t in range(10):
-        u = [z[s] - z[s - lag] if lag else z[s] for s in range(lag, min(t, 6))]
+        bases = [z[s - 1] if lag == 1 else z[s % lag : min(s, 6) : lag].mean() if lag else 0.0 for s in range(lag, 10)]
+        u = [z[s] - bases[s - lag] for s in range(lag, min(t, 6))]
         n, k = len(u), prior.weight
         mean = (k * prior.mean + sum(u)) / (k + n)
         spread = n * np.var(u) + k * n / (k + n) * (np.mean(u) - prior.mean) ** 2 if n else 0.0
         scale = math.sqrt((prior.freedom * prior.variance + spread) / (prior.freedom + n) * (1 + 1 / (k + n)))
         log_prob = (
-            norm.logpdf(z[t], prior.level, prior.spread)
-            if t < lag
-            else norm.logpdf(z[t], mean + (z[t - lag] if lag else 0), scale)
+            norm.logpdf(z[t], prior.level, prior.spread) if t < lag else norm.logpdf(z[t], mean + bases[t - lag], scale)
         )
         density, future = density + log_prob, future + (log_prob if t >= 6 else 0.0)
     model = white_noise(view)
@@ -179,8 +178,8 @@ def test_forecasts_have_the_moments_of_the_predictive_distribution(lag):
     draws = model.forecast(x, 5, 4000)["x"]
     viewed = model.read(x)
     for h in range(5):
-        steps = h // lag + 1 if lag else 1  # increments since the last value at this phase
-        last = x[:, 8 - lag + h % lag, 0] if lag else 0.0
+        steps = h + 1 if lag == 1 else 1  # increments since the last value
+        last = x[:, -1, 0] if lag == 1 else x[:, (8 + h) % lag : 6 : lag, 0].mean(1) if lag else 0.0
         state = viewed["x_state"][:, :3, 0].unbind(1)
         weight = prior.weight + state[0]
         mean = prior.mean + state[1] / weight
