@@ -13,7 +13,7 @@ from .column_inference import ColumnHints
 from .columns import Columns
 from .encoding import PanelSchema
 from .panel import SPLITS, Panel
-from .protocol import Cut
+from .protocol import Cut, begin_of
 from .reading import is_domain, read_panel, schema_beside
 from .windows import PanelWindows
 
@@ -151,6 +151,44 @@ class PanelData:
             ValueError: the split has no window.
         """
         return PanelWindows(self.panel, self.schema, split)
+
+    def before(self, steps: int) -> Self:
+        """Return the data divided by time before the last steps, with units from the new training part.
+
+        Args:
+            steps: number of steps for test, as in `Cut.test`.
+
+        Raises:
+            ValueError: the steps before have no training window.
+        """
+        cut = replace(self.schema.cut, split="time", test=steps)
+        return replace(self, schema=PanelSchema.from_data(self.panel, cut))
+
+    @property
+    def cutoff(self) -> str:
+        """Time of the first test step, or its distance from the ends, if the cut has a number of test steps."""
+        steps = self.schema.cut.test_steps
+        begin = begin_of(self.panel, steps)
+        if begin is None:
+            return f"{steps} steps to the end"
+        return self.panel.calendar.text(begin).removesuffix(" 00:00:00")
+
+    def following(self, steps: int) -> PanelWindows:
+        """Return the test windows whose futures begin less than `steps` steps after the first test step.
+
+        Args:
+            steps: number of steps.
+
+        Raises:
+            ValueError: there is no such window.
+        """
+        windows, observed = self.windows("test"), self.schema.cut.observed or 0
+        spans = self.schema.cut.spans(self.panel, "train+validation")
+        ends = {self.panel.series[index].name: end + steps for index, _, end in spans}
+        places = [place for place, (_, name, start) in enumerate(windows.keys) if start + observed < ends[name]]
+        if not places:
+            raise ValueError(f"{self.panel.name} has no window that begins within {steps} steps of {self.cutoff}")
+        return windows.subset(places)
 
     def parts(self) -> dict[str, str]:
         """Describe the windows of each split and the omitted ones, or state why a split is empty.
