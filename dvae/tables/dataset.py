@@ -174,7 +174,7 @@ class PanelData:
         return self.panel.calendar.text(begin).removesuffix(" 00:00:00")
 
     def following(self, steps: int) -> PanelWindows:
-        """Return the test windows whose futures begin less than `steps` steps after the first test step.
+        """Return the test windows whose futures begin before the cutoff `steps` steps later.
 
         Args:
             steps: number of steps.
@@ -182,12 +182,14 @@ class PanelData:
         Raises:
             ValueError: there is no such window.
         """
-        windows, observed = self.windows("test"), self.schema.cut.observed or 0
-        spans = self.schema.cut.spans(self.panel, "train+validation")
-        ends = {self.panel.series[index].name: end + steps for index, _, end in spans}
-        places = [place for place, (_, name, start) in enumerate(windows.keys) if start + observed < ends[name]]
+        windows, cut = self.windows("test"), self.schema.cut
+        if cut.test_steps <= steps:
+            return windows
+        later = replace(cut, test=cut.test_steps - steps).spans(self.panel, "train+validation")
+        ends = {self.panel.series[index].name: end - (cut.observed or 0) for index, _, end in later}
+        places = [place for place, (_, name, start) in enumerate(windows.keys) if start < ends[name]]
         if not places:
-            raise ValueError(f"{self.panel.name} has no window that begins within {steps} steps of {self.cutoff}")
+            raise ValueError(f"{self.panel.name} has no test window that begins within {steps} steps of {self.cutoff}")
         return windows.subset(places)
 
     def parts(self) -> dict[str, str]:

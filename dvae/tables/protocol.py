@@ -124,10 +124,9 @@ class Cut:
             if parts is not None and parts[index] not in split.split("+"):
                 continue
             if parts is None and not everywhere:
-                second = round(high * (1 - self.test))
-                if self.test_steps:
-                    before = None if sequence.times is None else int(np.searchsorted(sequence.times[:high], begin))
-                    second = max(high - self.test_steps, 0) if begin is None or before is None else before
+                second = high - self.test_steps if self.test_steps else round(high * (1 - self.test))
+                if begin is not None and sequence.times is not None:
+                    second = int(np.searchsorted(sequence.times[:high], begin))
                 low, high = self._between(high, second, split)
             spans.append((index, low, high))
         return spans

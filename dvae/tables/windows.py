@@ -170,8 +170,8 @@ class PanelWindows:
         """Times (N, 2) of the last observed and of the last step of each window; numbers of steps without times."""
         observed, steps = self.protocol.observed or 0, self.length or 0
         times, _ = self.times(steps)
-        moments = self._windows[1][:, None] + np.arange(steps) if times is None else times
-        return torch.as_tensor(moments)[:, [observed - 1, steps - 1]].double()
+        moments = self._windows[1][:, None] + torch.arange(steps) if times is None else torch.from_numpy(times)
+        return moments[:, [observed - 1, steps - 1]].double()
 
     @property
     def description(self) -> dict[str, Any]:
