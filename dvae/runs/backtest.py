@@ -24,7 +24,7 @@ from ..inference.evaluation.record import MODELS, Dims
 from ..inference.evaluation.result import PlainConsole, Table
 from ..inference.training.options import Training
 from ..models.method import Method
-from ..options import Count, nearest, require
+from ..options import Count, require
 from .directory import load
 from .sweep import require_ended, sweep
 
@@ -59,7 +59,7 @@ class Backtest(Evaluation):
             KeyError: if there is no such cutoff.
         """
         if cutoff not in self.cutoffs:
-            raise KeyError(f"no cutoff {cutoff!r}{nearest(cutoff, self.cutoffs)}; there are {', '.join(self.cutoffs)}")
+            raise KeyError(f"no cutoff {cutoff!r}; there are {', '.join(self.cutoffs)}")
         place = self.cutoffs.index(cutoff)
         kept = self.windows[place] > 0
         rows = {

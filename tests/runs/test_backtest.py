@@ -68,7 +68,7 @@ def test_scores_are_pooled_over_cutoffs_and_clustered_by_sequence(result):
     assert result.difference("auto", "last value", "CRPS").standard_error > 0
     assert result.plot()._repr_png_().startswith(b"\x89PNG")
     assert result.plot_calibration()._repr_png_().startswith(b"\x89PNG")
-    with pytest.raises(KeyError, match=r"no cutoff '2020-02-13' .did you mean '2020-02-12'"):
+    with pytest.raises(KeyError, match="no cutoff '2020-02-13'; there are 2020-02-12"):
         result.at("2020-02-13")
 
 
