@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -68,7 +68,7 @@ def backtest(
     data_set = source.open(*methods)
     if data_set.kind != "panel":
         raise UsageError(f"a backtest is of a table, and {source.data} is none; name a table with --data")
-    scored = {"scores": loading.SCORES["panel"], "samples": samples, "seed": seed}
+    scored: dict[str, Any] = {"scores": loading.SCORES["panel"], "samples": samples, "seed": seed}
     result = backtest_methods(methods, data_set, cutoffs, out, seeds, options, jobs, step=step, refit=refit, **scored)
     save_and_print(result, [out / "backtest.json"], figure)
     OUT.print(result.cutoff_table(score))

@@ -344,7 +344,7 @@ def conformal_bands(
     """
     require(Positive, rate=rate)
     sources = [prepare_windows(each) for each in (windows if isinstance(windows, list | tuple) else [windows])]
-    models = list(model) if isinstance(model, list | tuple) else [model] * len(sources)
+    models: list[Any] = list(model) if isinstance(model, list | tuple) else [model] * len(sources)
     if len(models) != len(sources) or not sources:
         raise ValueError(f"expected one model for each of {len(sources)} windows, got {len(models)}")
     cluster, _ = axis_names(sources[0].windows.description)
@@ -371,7 +371,7 @@ def conformal_bands(
         )
     with progress_bar(progress) as bar:
 
-        def futures(model: nn.Module | str, source: EvaluationWindows, label: str) -> Iterator[tuple[Tensor, Tensor]]:
+        def futures(model: Any, source: EvaluationWindows, label: str) -> Iterator[tuple[Tensor, Tensor]]:
             """Yield forecasts (B, K, H, D) and true futures by batch."""
             if isinstance(model, str):
                 name = model
