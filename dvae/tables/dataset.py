@@ -166,8 +166,14 @@ class PanelData:
 
     @property
     def cutoff(self) -> str:
-        """Time of the first test step, or its distance from the ends, if the cut has a number of test steps."""
+        """Time of the first test step, or its distance from the ends.
+
+        Raises:
+            ValueError: the cut has a share for test, and no number of steps.
+        """
         steps = self.schema.cut.test_steps
+        if not steps:
+            raise ValueError(f"test is the share {self.schema.cut.test:g}, which has no cutoff; give a number of steps")
         begin = begin_of(self.panel, steps)
         if begin is None:
             return f"{steps} steps to the end"
@@ -180,16 +186,16 @@ class PanelData:
             steps: number of steps.
 
         Raises:
-            ValueError: there is no such window.
+            ValueError: there is no such window, or the cut has no number of test steps.
         """
-        windows, cut = self.windows("test"), self.schema.cut
+        cutoff, windows, cut = self.cutoff, self.windows("test"), self.schema.cut
         if cut.test_steps <= steps:
             return windows
         later = replace(cut, test=cut.test_steps - steps).spans(self.panel, "train+validation")
         ends = {self.panel.series[index].name: end - (cut.observed or 0) for index, _, end in later}
         places = [place for place, (_, name, start) in enumerate(windows.keys) if start < ends[name]]
         if not places:
-            raise ValueError(f"{self.panel.name} has no test window that begins within {steps} steps of {self.cutoff}")
+            raise ValueError(f"{self.panel.name} has no test window that begins within {steps} steps of {cutoff}")
         return windows.subset(places)
 
     def parts(self) -> dict[str, str]:

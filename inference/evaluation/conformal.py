@@ -21,11 +21,12 @@ as in adaptive conformal inference (Gibbs and Candès 2021, arXiv 2106.00170). I
 (Angelopoulos, Candès and Tibshirani 2023, arXiv 2307.16895) of log s, whose bands stay finite:
 
     q_t = Q_t exp(θ_t)                          Q_t: the quantile of the earlier errors, with origins as clusters
-    θ_t = γ sum over s (m_s - (1 - level))      m_s: share of the windows of origin s outside their bands
+    θ_t = η sum over s (m_s - (1 - level))      m_s: share of the windows of origin s outside their bands
 
-Both use the origins s whose futures are complete at origin t. At most d origins are incomplete at a time, t included.
-For any data with s_t <= b Q_t and b >= 1, θ stays below log b + d γ. The mean of m over T origins is therefore at most
-1 - level + (log b + d γ) / (γ T). If s_t > a Q_t and a <= 1, it is at least 1 - level - (d γ - log a) / (γ T).
+Both use the origins s whose futures are complete at origin t. At most d origins are incomplete at a time, t included,
+and η = γ / √d: a larger step would make θ oscillate. For any data with s_t <= b Q_t and b >= 1, θ stays below
+log b + d η. The mean of m over T origins is therefore at most 1 - level + (log b + d η) / (η T). If s_t > a Q_t and
+a <= 1, it is at least 1 - level - (d η - log a) / (η T).
 """
 
 from __future__ import annotations
@@ -321,8 +322,8 @@ def conformal_bands(
         training_windows: training data of "climatology" and "nearest neighbours".
         seed: seed of the draws.
         batch_size: number of windows in a batch.
-        rate: step size of bands for windows divided by time. An origin without a window in its band widens the next
-            bands by almost this share. A larger rate follows changes faster, and its bands fluctuate more.
+        rate: step size of bands for windows divided by time. If no window of an origin lies in its band, the next bands
+            are wider by almost this share. A larger rate follows changes faster, and its bands fluctuate more.
         options: further arguments of the model's `forecast`.
         progress: whether to show a progress bar.
 
@@ -524,22 +525,24 @@ def adaptive_factors(
         distances: largest distances in a region (N, ...), NaN if unknown.
         origins: times (N, 2) of the last observed and of the last step of each window.
         level: share of windows to contain.
-        rate: γ, step size of the correction.
+        rate: γ, step size of the correction without overlapping futures.
         start: factor (...) before the first window, if it was calibrated on earlier windows; it replaces Q_t.
     """
     presents, places = origins[:, 0].unique(return_inverse=True)
     ends = torch.full_like(presents, -math.inf).scatter_reduce(0, places, origins[:, 1], "amax")
     windows = places.argsort().split(places.bincount().tolist())
+    started = torch.arange(1, len(presents) + 1)
+    overlap = (started - torch.searchsorted(ends.sort().values, presents, right=True)).max().item()
     shift = distances.new_zeros(distances.shape[1:])
     base = torch.full_like(shift, math.inf) if start is None else start.to(distances)
     in_force: list[Tensor] = []
     is_complete, used = torch.zeros(len(presents), dtype=torch.bool), 0
     for now in [*presents.tolist(), math.inf]:
-        newly = (ends <= now) & ~is_complete & (torch.arange(len(presents)) < len(in_force))
+        newly = (ends <= now) & ~is_complete & (started <= len(in_force))
         for origin in newly.nonzero().flatten().tolist():
             far = distances[windows[origin]]
             outside = mean_of_known((far > in_force[origin]).to(far).masked_fill(far.isnan(), torch.nan), 0)
-            change = rate * (outside - (1 - level))
+            change = rate / math.sqrt(overlap) * (outside - (1 - level))
             shift = shift + change.nan_to_num(0.0) * in_force[origin].isfinite()
         is_complete |= newly
         count = int(is_complete.sum())

@@ -217,8 +217,9 @@ def test_the_mean_outside_is_bounded_for_any_data(seed, delay, series, rate):
     factor, _ = adaptive_factors(distances, origins, LEVEL, rate, torch.ones(1, dtype=torch.float64))
     mean = float((distances > factor).double().mean())
     # at an origin, the futures of `delay` origins are incomplete, its own included
-    assert mean <= 1 - LEVEL + (math.log(most) + delay * rate) / (rate * count) + 1e-9
-    assert mean >= 1 - LEVEL - (delay * rate - math.log(least)) / (rate * count) - 1e-9
+    step = rate / math.sqrt(delay)
+    assert mean <= 1 - LEVEL + (math.log(most) + delay * step) / (step * count) + 1e-9
+    assert mean >= 1 - LEVEL - (delay * step - math.log(least)) / (step * count) - 1e-9
 
 
 @given(st.integers(0, 10**6), st.integers(1, 5))
@@ -261,7 +262,8 @@ def test_adaptive_bands_hold_their_level_where_fixed_ones_fail(kind, fixed_holds
             parts.append(float((scores <= each)[later].double().mean()))
     mean, error = rate(np.array(shares))
     ratio = {"drift": 4, "shift": 3}.get(kind, 1)  # of the largest quantile to the first
-    assert abs(mean - LEVEL) <= error + (math.log(ratio) + delay * RATE) / (RATE * (count - first))
+    step = RATE / math.sqrt(delay)
+    assert abs(mean - LEVEL) <= error + (math.log(ratio) + delay * step) / (step * (count - first))
     fixed_mean, fixed_error = rate(np.array(fixed_shares))
     assert (abs(fixed_mean - LEVEL) <= fixed_error + 0.03) == bool(fixed_holds)
 
@@ -292,7 +294,7 @@ def test_bands_of_a_split_by_time_continue_over_the_test_windows(panel, tmp_path
     count = len(test.origins[:, 0].unique())
     for region in ("number", "step", "future"):
         name = f"calibrated 90 %, {region}"
-        assert abs(coverage[name].mean - LEVEL) < (math.log(3) + 2 * RATE) / (RATE * count) + 0.01, region
+        assert abs(coverage[name].mean - LEVEL) < (math.log(3) + RATE) / (RATE * count) + 0.01, region
         assert fixed[name].mean < coverage[name].mean - 0.03, region
     widths = [coverage[f"width calibrated 90 %, {region}"].mean for region in ("number", "step", "future")]
     assert widths == sorted(widths)
