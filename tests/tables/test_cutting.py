@@ -133,7 +133,7 @@ def test_windows_after_successive_cutoffs_are_those_of_the_whole_test_part():
         assert {lengths[name] - start - 5 - steps for _, name, start in part} <= {0, -2, -4}
     with pytest.raises(ValueError, match="has no test window that begins within 0 steps of 20 steps to the end"):
         data.before(20).following(0)
-    with pytest.raises(ValueError, match="test is the share 0.2, which has no cutoff"):
+    with pytest.raises(ValueError, match=r"test is the share 0\.2, which has no cutoff"):
         data.following(6)
 
 
