@@ -180,7 +180,7 @@ class PanelData:
         return self.panel.calendar.text(begin).removesuffix(" 00:00:00")
 
     def following(self, steps: int) -> PanelWindows:
-        """Return the test windows whose futures begin before the cutoff `steps` steps later.
+        """Return the test windows whose futures begin before the next cutoff, `steps` steps later.
 
         Args:
             steps: number of steps.

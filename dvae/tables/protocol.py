@@ -172,7 +172,7 @@ class Cut:
 
 
 def begin_of(panel: Panel, steps: int) -> float | None:
-    """Return the time of the first of the last steps of a panel; None if its sequences share no calendar.
+    """Return the time at which the last steps of a panel begin; None if its sequences share no calendar.
 
     They share one if they have dates, and all their different dates are at most twice as many as those of one sequence.
 
