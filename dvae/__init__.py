@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from .program.oracle import Oracle, edge_costs, kl_gap, linear_gaussian_surrogate, model_edge_costs, model_kl_gap
     from .program.rollout import InputNoise, ScheduledSampling
     from .runs.ablation import Ablation, ablate
+    from .runs.backtest import Backtest, backtest
     from .runs.directory import load
 
 __all__ = [
@@ -66,6 +67,7 @@ __all__ = [
     "Alternatives",
     "ArrayWindows",
     "Audit",
+    "Backtest",
     "Bracket",
     "Comparison",
     "Descent",
@@ -89,6 +91,7 @@ __all__ = [
     "alternatives",
     "annealed_bound",
     "audit",
+    "backtest",
     "bracket",
     "calibrate",
     "compare",
@@ -156,6 +159,7 @@ _MODULES = {
         "program.rollout": "InputNoise ScheduledSampling",
         "program.enumeration": "Discrete",
         "runs.ablation": "Ablation ablate",
+        "runs.backtest": "Backtest backtest",
         "runs.directory": "load",
     }.items()
     for name in names.split()

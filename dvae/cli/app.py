@@ -47,6 +47,7 @@ GROUPS = {
     },
     "assess": {
         "evaluate": ("assessment:evaluate", "Score runs on test windows."),
+        "backtest": ("backtests:backtest", "Fit methods to a table before several cutoffs, and score them after each."),
         "compare": ("assessment:compare", "Compare runs: bounds, paired differences with errors, use of latents."),
         "check calibration": ("checks:calibration", "Calibrate the guide by simulation, and check predictions."),
         "check posterior": ("checks:posterior", "Compare the guide with NUTS samples of the posterior."),
@@ -199,7 +200,10 @@ def _suggestions(arguments: Sequence[str]) -> Iterator[str]:
     name = named(arguments) or ""
     remaining = arguments[len(name.split()) :]
     hints = get_type_hints(function)
-    kinds = [*filter(is_dataclass, hints.values()), *(methods().values() if name in ("fit", "sweep") else ())]
+    kinds = [
+        *filter(is_dataclass, hints.values()),
+        *(methods().values() if name in ("fit", "sweep", "backtest") else ()),
+    ]
     for kind in kinds:  # nested dataclasses are appended during the loop
         hints = (nested := get_type_hints(kind)) | hints
         kinds += filter(is_dataclass, nested.values())
@@ -208,7 +212,7 @@ def _suggestions(arguments: Sequence[str]) -> Iterator[str]:
         if word not in options and (suggestion := nearest(word, options)):
             yield f"{word} is not an option of dvae {name}{suggestion}"
     choices = {option: _choices(hint) for option, hint in hints.items()}
-    names = {"fit": [*methods(), *metric_models()], "sweep": choices.get("method")}.get(name)
+    names = [*methods(), *metric_models()] if name == "fit" else choices.get("method")
     for previous, word in pairwise(["", *remaining]):
         option = previous if previous.startswith("--") else ""
         allowed = choices.get(option.removeprefix("--").replace("-", "_")) if option else names

@@ -116,7 +116,7 @@ class DataOptions(ColumnOptions):
         stride: for a table: steps from one test window to the next.
         split: for a table: divide sequences, time or groups into training, validation and test.
         validation: for a table: share of the data for validation, which selects the weights.
-        test: for a table: share of the data for the test.
+        test: for a table: share of the data for the test, or number of last steps of a split by time.
         season: for a table: period in steps, which the seasonal reference forecast repeats.
     """
 
@@ -137,7 +137,7 @@ class DataOptions(ColumnOptions):
     stride: Expert[int | None] = None
     split: Literal["sequence", "time", "group"] | None = None
     validation: Expert[Share | None] = None
-    test: Expert[Share | None] = None
+    test: Expert[Frames | Share | None] = None
     season: Frames | None = None
 
     def open(self, *methods: Trainable) -> Any:

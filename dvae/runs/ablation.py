@@ -36,14 +36,13 @@ from ..inference.evaluation.estimates import Estimate, number
 from ..inference.evaluation.multiple_comparisons import holm
 from ..inference.evaluation.record import Dims
 from ..inference.evaluation.result import Result, Table, new_figure, progress_bar, styled
-from ..inference.training.checkpoints import ENDED
 from ..inference.training.options import Training
 from ..models.family.equations import Equations
 from ..models.method import Method
 from ..program.oracle import kl_gap, model_kl_gap, ones
 from .directory import load, training_of
 from .kinds import Dataset
-from .sweep import sweep
+from .sweep import require_ended, sweep
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -391,10 +390,7 @@ def ablate(
             methods[edge.run] = reduced
     options = training if isinstance(training, Training) else {"progress": progress, **(training or {})}
     results = sweep(methods, data, out, seeds, training_of(full, data, options), jobs)
-    if failed := [str(result) for result in results if result.status not in ENDED]:
-        raise RuntimeError(
-            "\n".join([f"{len(failed)} of {len(results)} runs failed; the same call retries them", *failed])
-        )
+    require_ended(results)
     comparison = compare(
         {name: [load(Path(out) / f"{name}-seed{run_seed}").model for run_seed in seeds] for name in methods},
         data.windows("test"),

@@ -179,6 +179,17 @@ def sweep(
     return outcomes
 
 
+def require_ended(outcomes: Sequence[Outcome]) -> None:
+    """Raise an error if a run of a sweep failed.
+
+    Raises:
+        RuntimeError: a run failed; the message lists all of these.
+    """
+    if failed := [str(outcome) for outcome in outcomes if outcome.status not in ENDED]:
+        summary = f"{len(failed)} of {len(outcomes)} runs failed; the same call retries them"
+        raise RuntimeError("\n".join([summary, *failed]))
+
+
 @dataclass(frozen=True)
 class _Run:
     """Arguments of a worker; paths are absolute, because a worker may have another working directory."""

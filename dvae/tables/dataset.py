@@ -15,7 +15,7 @@ from .columns import Columns
 from .domains import DOMAINS
 from .encoding import PanelSchema
 from .panel import SPLITS, Panel
-from .protocol import Cut
+from .protocol import Cut, begin_of
 from .reading import is_domain, read_panel, schema_beside
 from .windows import PanelWindows
 
@@ -155,6 +155,52 @@ class PanelData:
             ValueError: the split has no window.
         """
         return PanelWindows(self.panel, self.schema, split)
+
+    def before(self, steps: int) -> Self:
+        """Return the data divided by time before the last steps, with units from the new training part.
+
+        Args:
+            steps: number of steps for test, as in `Cut.test`.
+
+        Raises:
+            ValueError: the steps before have no training window.
+        """
+        cut = replace(self.schema.cut, split="time", test=steps)
+        return replace(self, schema=PanelSchema.from_data(self.panel, cut))
+
+    @property
+    def cutoff(self) -> str:
+        """Time of the first test step, or its distance from the ends.
+
+        Raises:
+            ValueError: the cut has a share for test, and no number of steps.
+        """
+        steps = self.schema.cut.test_steps
+        if not steps:
+            raise ValueError(f"test is the share {self.schema.cut.test:g}, which has no cutoff; give a number of steps")
+        begin = begin_of(self.panel, steps)
+        if begin is None:
+            return f"{steps} steps to the end"
+        return self.panel.calendar.text(begin).removesuffix(" 00:00:00")
+
+    def following(self, steps: int) -> PanelWindows:
+        """Return the test windows whose futures begin before the next cutoff, `steps` steps later.
+
+        Args:
+            steps: number of steps.
+
+        Raises:
+            ValueError: there is no such window, or the cut has no number of test steps.
+        """
+        cutoff, windows, cut = self.cutoff, self.windows("test"), self.schema.cut
+        if cut.test_steps <= steps:
+            return windows
+        later = replace(cut, test=cut.test_steps - steps).spans(self.panel, "train+validation")
+        ends = {self.panel.series[index].name: end - (cut.observed or 0) for index, _, end in later}
+        places = [place for place, (_, name, start) in enumerate(windows.keys) if start < ends[name]]
+        if not places:
+            raise ValueError(f"{self.panel.name} has no test window that begins within {steps} steps of {cutoff}")
+        return windows.subset(places)
 
     def parts(self) -> dict[str, str]:
         """Describe the windows of each split and the omitted ones, or state why a split is empty.

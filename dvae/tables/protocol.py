@@ -23,7 +23,9 @@ class Cut:
         split: unit of the split: "sequence" for whole sequences, "time" for the last steps of every sequence, "group"
             for all sequences of a group. If the data define the split of each sequence, it is used instead.
         validation: share for validation.
-        test: share for test.
+        test: share for test; or, for a split by time, the number of last steps, at least 1. Sequences with dates then
+            share the time at which the test begins, if they share most of their times; otherwise the steps are counted
+            from the end of each sequence. `validation` is a share of the steps before.
         seed: random seed of the split by sequence or group.
         season: period of the data in steps, such as 7 for daily data with a weekly period; the reference forecast
             "seasonal" repeats it.
@@ -38,7 +40,7 @@ class Cut:
     stride: Frames | None = None
     split: Literal["sequence", "time", "group"] = "sequence"
     validation: Share = 0.1
-    test: Share = 0.2
+    test: Share | Frames = 0.2
     seed: Delay = 0
     season: Frames | None = None
 
@@ -53,7 +55,12 @@ class Cut:
                 f"season is {self.season} and observed {self.observed}; season must be at most observed; shorten the "
                 "season, or observe more steps"
             )
-        if self.validation + self.test >= 1:
+        if self.test_steps and self.split != "time":
+            raise ValueError(
+                f"test is {self.test} steps and split {self.split!r}; give a share below 1, or split by time: "
+                'split="time"'
+            )
+        if self.validation + (0 if self.test_steps else self.test) >= 1:
             raise ValueError(
                 f"validation is {self.validation} and test {self.test}; their sum must be below 1, so that data remain "
                 "for training"
@@ -63,6 +70,11 @@ class Cut:
     def length(self) -> int | None:
         """T, steps of a window."""
         return None if self.observed is None or self.horizon is None else self.observed + self.horizon
+
+    @property
+    def test_steps(self) -> int:
+        """Number of test steps at the end of the data; 0 if `test` is a share."""
+        return int(self.test) if isinstance(self.test, int) else 0
 
     @property
     def name(self) -> str:
@@ -105,20 +117,25 @@ class Cut:
         """
         spans = []
         everywhere = split in ("all", "last")
+        begin = begin_of(panel, self.test_steps) if self.test_steps and not everywhere else None
         parts = None if self.split == "time" or everywhere else self._parts(panel)
         for index, sequence in enumerate(panel.series):
             low, high = 0, len(sequence) if split == "last" else panel.present(sequence)
             if parts is not None and parts[index] not in split.split("+"):
                 continue
             if parts is None and not everywhere:
-                low, high = self._between(high, split)
+                second = high - self.test_steps if self.test_steps else round(high * (1 - self.test))
+                if begin is not None and sequence.times is not None:
+                    second = int(np.searchsorted(sequence.times[:high], begin))
+                low, high = self._between(high, second, split)
             spans.append((index, low, high))
         return spans
 
-    def _between(self, total: int, split: str) -> tuple[int, int]:
-        """Return first step and end of a split by time, for a sequence of this length."""
+    def _between(self, total: int, second: int, split: str) -> tuple[int, int]:
+        """Return first step and end of a split by time, for a sequence of this length and first test step."""
         assert self.observed is not None
-        first, second = (round(total * (1 - share)) for share in (self.validation + self.test, self.test))
+        share = (1 - self.validation) * second if self.test_steps else total * (1 - (self.validation + self.test))
+        first = round(share)
         bounds = {"train": (0, first), "validation": (first - self.observed, second)}
         bounds |= {"test": (second - self.observed, total), "train+validation": (0, second)}
         low, high = bounds[split]
@@ -152,3 +169,21 @@ class Cut:
         parts = ["test"] * test + ["validation"] * validation + ["train"] * len(names)
         part_of = dict(zip(names, parts, strict=False))
         return [part_of[unit] for unit in units]
+
+
+def begin_of(panel: Panel, steps: int) -> float | None:
+    """Return the time at which the last steps of a panel begin; None if its sequences share no calendar.
+
+    They share one if they have dates, and all their different dates are at most twice as many as those of one sequence.
+
+    Args:
+        panel: the sequences.
+        steps: number of steps at the end, counted in the sequence that ends last.
+    """
+    times = [sequence.times[: panel.present(sequence)] for sequence in panel if sequence.times is not None]
+    if panel.calendar.kind != "dates" or len(times) < len(panel):
+        return None
+    if len(np.unique(np.concatenate(times))) > 2 * max(map(len, times)):
+        return None
+    last = max((one for one in times if len(one)), key=lambda one: (one[-1], len(one)))
+    return float(last[max(len(last) - steps, 0)])

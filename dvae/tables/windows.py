@@ -173,6 +173,14 @@ class PanelWindows:
         return [(split, group, start) for (split, _, start), group in zip(self.keys, groups, strict=True)]
 
     @property
+    def origins(self) -> Tensor:
+        """Times (N, 2) of the last observed and of the last step of each window; numbers of steps without times."""
+        observed, steps = self.protocol.observed or 0, self.length or 0
+        times, _ = self.times(steps)
+        moments = self._windows[1][:, None] + torch.arange(steps) if times is None else torch.from_numpy(times)
+        return moments[:, [observed - 1, steps - 1]].double()
+
+    @property
     def description(self) -> dict[str, Any]:
         """Columns with their units, means and scales, stored with results."""
         columns = {name: column.unit for column in self.schema.columns.targets for name in column.coordinates}

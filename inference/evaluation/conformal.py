@@ -15,6 +15,18 @@ prediction (Lee, Barber and Willett 2023, arXiv 2306.06342; groups as in Dunn, W
 The band contains the future of a window drawn from a new cluster with probability `level` at least. For clusters of one
 window each, q is the ⌈(C + 1) level⌉-th smallest distance, and without ties the probability is level + 1 / (C + 1) at
 most.
+
+Later steps of a sequence are not exchangeable with earlier ones. For windows of a split by time, q therefore adapts,
+as in adaptive conformal inference (Gibbs and Candès 2021, arXiv 2106.00170). It is corrected by quantile tracking
+(Angelopoulos, Candès and Tibshirani 2023, arXiv 2307.16895) of log s, whose bands stay finite:
+
+    q_t = Q_t exp(θ_t)                          Q_t: the quantile of the earlier errors, with origins as clusters
+    θ_t = η sum over s (m_s - (1 - level))      m_s: share of the windows of origin s outside their bands
+
+Both use the origins s whose futures are complete at origin t. At most d origins are incomplete at a time, t included,
+and η = γ / √d: a larger step would make θ oscillate. For any data with s_t <= b Q_t and b >= 1, θ stays below
+log b + d η. The mean of m over T origins is therefore at most 1 - level + (log b + d η) / (η T). If s_t > a Q_t and
+a <= 1, it is at least 1 - level - (d η - log a) / (η T).
 """
 
 from __future__ import annotations
@@ -22,8 +34,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -32,7 +44,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from ...data.sequences import HeldOutWindows, axis_names, cluster_keys, columns_of, mean_of_known, scales_of
-from ...options import nearest
+from ...options import Amount, Positive, nearest, require
 from .evaluate import evaluate, forecaster_of, forecasts_of
 from .evaluation import Evaluation
 from .evaluation_windows import EvaluationWindows, cluster_index, prepare_windows, seeded_evaluation
@@ -62,6 +74,7 @@ class PredictionBands(Result):
         options: further arguments of the model's `forecast`.
         clusters: C, number of exchangeable clusters among the calibration windows.
         data: description of these windows.
+        rate: γ of bands that adapt over time; 0 for fixed ones.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -80,6 +93,7 @@ class PredictionBands(Result):
     options: Mapping[str, Any]
     clusters: int
     data: Mapping[str, Any]
+    rate: float = 0.0
 
     def apply(self, forecasts: Tensor, region: str = "future") -> tuple[Tensor, Tensor]:
         """Return the bands of forecasts that were made as in the calibration.
@@ -111,10 +125,14 @@ class PredictionBands(Result):
         """Return scores for `evaluate`: coverage of the future and width of bands, before and after recalibration.
 
         Before recalibration, the band is m ± q v, with q the quantile of the distances of each forecast from the
-        others. Clips have equal weight in the scores, as in the calibration.
+        others. Clips have equal weight in the scores, as in the calibration. Bands that adapt continue over the origins
+        of the windows, in the order of time, and windows have equal weight.
 
         Args:
             windows: windows to evaluate.
+
+        Raises:
+            ValueError: if bands adapt, but the windows are not from a table and have no times.
         """
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
@@ -140,18 +158,36 @@ class PredictionBands(Result):
                     result[kind, region] = mean_of_known(inside, (-2, -1)), mean_of_known(width, (-2, -1))
             return result
 
+        def distances_and_spread(region: str, forecasts: Tensor, truth: Tensor, *_: Any) -> Tensor:
+            """Return the inputs of `adapted` (B, 2, H, D), because a band depends on the errors of other batches."""
+            spread = self._spread(forecasts).expand(truth.shape)
+            far = largest_by_region(standardised(forecasts, truth, spread), region)
+            return torch.stack([far.expand(truth.shape), (spread / scales).masked_fill(truth.isnan(), torch.nan)], 1)
+
+        def adapted(region: str, place: int, values: Tensor, clusters: Tensor) -> Sequence[Any]:
+            far, spread = values.unbind(1)
+            start = self._factor(region, far).expand(far[0].shape)
+            factor, _ = adaptive_factors(far, _origins_of(windows), self.level, self.rate, start)
+            inside = (far <= factor).double().masked_fill(far.isnan(), torch.nan)
+            return cluster_means(mean_of_known((inside, 2 * factor * spread)[place], (-2, -1)), clusters)
+
         def measure(kind: str, region: str, place: int) -> Measure:
             name, in_unit = (("", "share"), ("width ", unit))[place]
-            return Measure(
+            result = Measure(
                 f"{name}{kind} {percent}, {region}",
                 lambda forecasts, truth, past, index: coverage_and_width(forecasts, truth)[kind, region][place],
                 in_unit,
                 better="",
-                pool=equally_weighted_clusters,
+                pool=cluster_means if self.rate else equally_weighted_clusters,
                 least=least[kind],
                 of_draws=True,
-                note="raw: quantiles of the forecasts; calibrated: conformal bands. Sequences have equal weight",
+                note="raw: quantiles of the forecasts; calibrated: conformal bands"
+                + (", which adapt over the origins" if self.rate else ". Sequences have equal weight"),
             )
+            if self.rate and kind == "calibrated":
+                functions = partial(distances_and_spread, region), partial(adapted, region, place)
+                return replace(result, function=functions[0], pool=functions[1])
+            return result
 
         return [measure(kind, region, place) for place in (0, 1) for region in REGIONS for kind in least]
 
@@ -193,7 +229,8 @@ class PredictionBands(Result):
     def table(self) -> Table:
         """Return a table of factors: mean over steps and coordinates, smallest and largest."""
         cluster, step = axis_names(self.data)
-        title = f"bands of {100 * self.level:g} % · {self.data['windows']} windows of {self.clusters} {cluster}s"
+        unit = "origin" if self.rate else cluster
+        title = f"bands of {100 * self.level:g} % · {self.data['windows']} windows of {self.clusters} {unit}s"
         table = Table(
             title=title,
             caption=f"factor: half the width of a band divided by the spread of forecasts, K = {self.samples}",
@@ -230,6 +267,7 @@ class PredictionBands(Result):
     @override
     def check(self) -> None:
         _check_level(self.level)
+        require(Amount, rate=self.rate)
         shape = self.factors["number"].shape
         arrays = [self.factors[region] for region in REGIONS] + ([] if self.spread is None else [self.spread])
         if [each.shape for each in arrays] != [shape, (shape[0], 1), (1, 1), shape][: len(arrays)]:
@@ -246,8 +284,8 @@ class PredictionBands(Result):
 
 
 def conformal_bands(
-    model: nn.Module | str,
-    windows: HeldOutWindows,
+    model: nn.Module | str | Sequence[nn.Module],
+    windows: HeldOutWindows | Sequence[HeldOutWindows],
     level: float = 0.9,
     *,
     groups: Sequence[str] | None = None,
@@ -256,6 +294,7 @@ def conformal_bands(
     training_windows: HeldOutWindows | None = None,
     seed: int = 0,
     batch_size: int = 32,
+    rate: float = 0.2,
     options: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> PredictionBands:
@@ -263,12 +302,16 @@ def conformal_bands(
 
     The bands contain the future of new windows with probability `level` if their clusters are exchangeable with the
     calibration clusters, for example if both are of the same people and styles. Calibration on clusters of one person
-    or style gives no guarantee for another. Later steps of the same sequences are not exchangeable with earlier ones,
-    so windows divided by time are refused.
+    or style gives no guarantee for another.
+
+    Later steps of the same sequences are not exchangeable with earlier ones. For windows divided by time, bands
+    therefore adapt from origin to origin (`rate`). The share of windows inside, averaged over many origins, then tends
+    to `level`, whatever the data. The share at a single origin, or of a single sequence, has no guarantee.
 
     Args:
-        model: a model (`Forecasting`), or the name of a reference row (`References`).
-        windows: calibration windows.
+        model: a model (`Forecasting`), or the name of a reference row (`References`); or one model for each of several
+            `windows`.
+        windows: calibration windows; or several, such as those after successive cutoffs.
         level: share of windows to contain, between 0 and 1.
         groups: name of the exchangeable group of each window, if groups are larger than clusters, such as its style. A
             level of 0.9 needs at least 9 groups.
@@ -279,6 +322,8 @@ def conformal_bands(
         training_windows: training data of "climatology" and "nearest neighbours".
         seed: seed of the draws.
         batch_size: number of windows in a batch.
+        rate: step size of bands for windows divided by time. If no window of an origin lies in its band, the next bands
+            are wider by almost this share. A larger rate follows changes faster, and its bands fluctuate more.
         options: further arguments of the model's `forecast`.
         progress: whether to show a progress bar.
 
@@ -287,8 +332,9 @@ def conformal_bands(
         `PredictionBands.scores` evaluates the coverage on other windows.
 
     Raises:
-        ValueError: when the level is invalid or needs more clusters, forecasts have no spread, or `groups` and windows
-            differ in number. Also when windows cannot be forecast, or are part of a split by time.
+        ValueError: when the level is invalid or needs more clusters or origins, forecasts have no spread, or `groups`
+            and windows differ in number. Also when windows cannot be forecast, or are divided by time but have no
+            times, or `groups`.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -297,30 +343,36 @@ def conformal_bands(
         >>> {region: factor.shape for region, factor in bands.factors.items()}
         {'number': (4, 2), 'step': (4, 1), 'future': (1, 1)}
     """
-    eval_windows = prepare_windows(windows)
-    windows, (cluster, _) = eval_windows.windows, axis_names(eval_windows.windows.description)
-    parts = {split for split, _, _ in eval_windows.keys} - {"all", "last"}
-    if parts and getattr(windows.protocol, "split", None) == "time":
+    require(Positive, rate=rate)
+    sources = [prepare_windows(each) for each in (windows if isinstance(windows, list | tuple) else [windows])]
+    models: list[Any] = list(model) if isinstance(model, list | tuple) else [model] * len(sources)
+    if len(models) != len(sources) or not sources:
+        raise ValueError(f"expected one model for each of {len(sources)} windows, got {len(models)}")
+    cluster, _ = axis_names(sources[0].windows.description)
+    by_time = {_is_split_by_time(source) for source in sources}
+    if len(by_time) > 1 or (by_time == {True} and groups is not None):
         raise ValueError(
-            f"these windows are the {' and '.join(sorted(parts))} part of {cluster}s divided by time (split='time'). "
-            f"Prediction bands have their nominal coverage for the future of other {cluster}s, and less for later "
-            f"steps of the same ones. Divide whole {cluster}s by split='sequence' or 'group', or calibrate on all "
-            f"windows of other {cluster}s, data.windows('all')"
+            f"windows divided by time calibrate bands over time, and other windows over {cluster}s or `groups`; give "
+            "windows of one kind, and `groups` only if they are not divided by time"
         )
-    keys = cluster_keys(windows) if groups is None else [("", group, 0) for group in groups]
-    if len(keys) != len(eval_windows.keys):
-        raise ValueError(f"groups must have one name for each of {len(eval_windows.keys)} windows, got {len(keys)}")
+    origins = torch.cat([_origins_of(source.windows) for source in sources]) if by_time == {True} else None
+    count = sum(len(source.keys) for source in sources)
+    keys = [key for source in sources for key in cluster_keys(source.windows)]
+    keys = keys if groups is None else [("", group, 0) for group in groups]
+    if len(keys) != count:
+        raise ValueError(f"groups must have one name for each of {count} windows, got {len(keys)}")
     places, required = cluster_index(keys), _min_count(_check_level(level))
-    clusters = int(places.max()) + 1
+    clusters = int(places.max()) + 1 if origins is None else len(origins[:, 0].unique())
     if clusters < required:
         unit, highest = f"{cluster}s" if groups is None else "groups", math.floor(100 * clusters / (clusters + 1))
+        unit = unit if origins is None else "origins"
         raise ValueError(
             f"prediction bands of {100 * level:g} % need at least {required} {unit} of calibration windows, got "
             f"{clusters}; use more, or a level of at most {highest} %"
         )
     with progress_bar(progress) as bar:
 
-        def futures(source: EvaluationWindows, label: str) -> Iterator[tuple[Tensor, Tensor]]:
+        def futures(model: Any, source: EvaluationWindows, label: str) -> Iterator[tuple[Tensor, Tensor]]:
             """Yield forecasts (B, K, H, D) and true futures by batch."""
             if isinstance(model, str):
                 name = model
@@ -336,21 +388,27 @@ def conformal_bands(
         spread = None
         if residuals is not None:
             errors = [
-                truth - forecasts.mean(1) for forecasts, truth in futures(prepare_windows(residuals), "residuals")
+                truth - forecasts.mean(1)
+                for forecasts, truth in futures(models[0], prepare_windows(residuals), "residuals")
             ]
             spread = mean_of_known(torch.cat(errors).square(), 0).sqrt()
         batches, count = [], 0
-        for forecasts, truth in futures(eval_windows, "calibration"):
-            count = forecasts.shape[1]
-            batches.append(standardised(forecasts, truth, _deviations(forecasts) if spread is None else spread))
-    far = torch.cat(batches)
-    factors = {region: quantile(largest_by_region(far, region), places, level) for region in REGIONS}
+        for each, source in zip(models, sources, strict=True):
+            for forecasts, truth in futures(each, source, "calibration"):
+                count = forecasts.shape[1]
+                batches.append(standardised(forecasts, truth, _deviations(forecasts) if spread is None else spread))
+    by_region = {region: largest_by_region(torch.cat(batches), region) for region in REGIONS}
+    factors = {
+        region: quantile(far, places, level) if origins is None else adaptive_factors(far, origins, level, rate)[1]
+        for region, far in by_region.items()
+    }
     if not all(factor.isfinite().all() for factor in factors.values()):
         raise ValueError(
             "these prediction bands would be infinite. Either forecasts have no spread, such as point forecasts: pass "
             f"`residuals`, windows to estimate a spread. Or a value was observed in too few {cluster}s: use "
             "more windows"
         )
+    fingerprint = "+".join(source.windows.fingerprint for source in sources)
     return PredictionBands(
         level=level,
         factors={region: factor.numpy() for region, factor in factors.items()},
@@ -359,8 +417,26 @@ def conformal_bands(
         seed=seed,
         options=dict(options or {}),
         clusters=clusters,
-        data=eval_windows.description(),
+        data={**sources[-1].description(), "windows": len(keys), "fingerprint": fingerprint},
+        rate=0.0 if origins is None else rate,
     )
+
+
+def _is_split_by_time(source: EvaluationWindows) -> bool:
+    """Return whether windows are a part of sequences divided by time."""
+    is_part = any(split not in ("all", "last") for split, _, _ in source.keys)
+    return is_part and getattr(source.windows.protocol, "split", None) == "time"
+
+
+def _origins_of(windows: HeldOutWindows) -> Tensor:
+    """Return the times (N, 2) of the last observed and of the last step of each window."""
+    origins: Tensor | None = getattr(windows, "origins", None)
+    if origins is None:
+        raise ValueError(
+            f"bands that adapt over time need windows with times, such as those of dvae.tables.PanelData, got "
+            f"{type(windows).__name__}, which have no `origins`"
+        )
+    return origins
 
 
 def equally_weighted_clusters(values: Tensor, clusters: Tensor) -> list[float]:
@@ -435,6 +511,46 @@ def quantile(distances: Tensor, places: Tensor, level: float) -> Tensor:
     reached = weights.cumsum(0) >= level * (clusters + 1) - 1e-9
     result = ordered.gather(0, reached.byte().argmax(0, keepdim=True))[0]
     return result.masked_fill(~reached.any(0), math.inf).reshape(distances.shape[1:])
+
+
+def adaptive_factors(
+    distances: Tensor, origins: Tensor, level: float, rate: float, start: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return the factor of each window's band (N, ...) under a split by time, and the factor (...) after all of them.
+
+    The module docstring has the equations. The factor of a window depends only on windows whose future is complete at
+    its origin. It is infinite while they have too few origins for a quantile.
+
+    Args:
+        distances: largest distances in a region (N, ...), NaN if unknown.
+        origins: times (N, 2) of the last observed and of the last step of each window.
+        level: share of windows to contain.
+        rate: γ, step size of the correction without overlapping futures.
+        start: factor (...) before the first window, if it was calibrated on earlier windows; it replaces Q_t.
+    """
+    presents, places = origins[:, 0].unique(return_inverse=True)
+    ends = torch.full_like(presents, -math.inf).scatter_reduce(0, places, origins[:, 1], "amax")
+    windows = places.argsort().split(places.bincount().tolist())
+    started = torch.arange(1, len(presents) + 1)
+    overlap = (started - torch.searchsorted(ends.sort().values, presents, right=True)).max().item()
+    shift = distances.new_zeros(distances.shape[1:])
+    base = torch.full_like(shift, math.inf) if start is None else start.to(distances)
+    in_force: list[Tensor] = []
+    is_complete, used = torch.zeros(len(presents), dtype=torch.bool), 0
+    for now in [*presents.tolist(), math.inf]:
+        newly = (ends <= now) & ~is_complete & (started <= len(in_force))
+        for origin in newly.nonzero().flatten().tolist():
+            far = distances[windows[origin]]
+            outside = mean_of_known((far > in_force[origin]).to(far).masked_fill(far.isnan(), torch.nan), 0)
+            change = rate / math.sqrt(overlap) * (outside - (1 - level))
+            shift = shift + change.nan_to_num(0.0) * in_force[origin].isfinite()
+        is_complete |= newly
+        count = int(is_complete.sum())
+        if start is None and count >= _min_count(level) and (count >= 1.1 * used or now == math.inf):
+            earlier, used = is_complete[places], count  # sorting all errors at each origin would be slow
+            base = quantile(distances[earlier], places[earlier].unique(return_inverse=True)[1], level)
+        in_force.append(base * shift.exp())
+    return torch.stack(in_force[:-1])[places], in_force[-1]
 
 
 def _min_count(level: float) -> int:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -175,9 +175,12 @@ def unflatten(kind: Any, record: Flat) -> Any:
             }
         if is_dataclass(hint):
             hints = _hints(hint)  # type: ignore[arg-type]
-            if not isinstance(value, Mapping) or value.keys() != hints.keys():
+            # older files of a result have fewer fields
+            optional = set() if path else {each.name for each in fields(hint) if each.default is not MISSING}
+            if not isinstance(value, Mapping) or not hints.keys() - optional <= value.keys() <= hints.keys():
                 raise TypeError(f"{label} must have the fields {', '.join(hints)}")
-            return hint(**{name: convert(value[name], within, (*path, name), model) for name, within in hints.items()})  # type: ignore[operator]
+            present = ((name, within) for name, within in hints.items() if name in value)
+            return hint(**{name: convert(value[name], within, (*path, name), model) for name, within in present})  # type: ignore[operator]
         if get_origin(hint) in (list, tuple):
             if not isinstance(value, list):
                 raise TypeError(f"{label} must be a list, got {type(value).__name__}")

@@ -6,8 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dvae.tables import Column, Columns, Panel, Series
-from dvae.tables.dataset import default_cut
-from dvae.tables.protocol import Cut
+from dvae.tables.calendar import Calendar
+from dvae.tables.dataset import PanelData, default_cut
+from dvae.tables.encoding import PanelSchema
+from dvae.tables.protocol import Cut, begin_of
 
 COLUMNS = Columns((Column("y"),))
 PARTS = ("train", "validation", "test")
@@ -92,6 +94,56 @@ def test_windows_start_wherever_they_fit():
     assert Cut(6, 2, split="time").starts(panel([100]), "test") == [(0, 74, 92)]
 
 
+@given(st.integers(1, 120), st.integers(1, 9), st.integers(1, 9), st.floats(0, 0.9), st.integers(1, 130))
+def test_a_number_of_test_steps_is_counted_from_the_end(total, observed, horizon, validation, test):
+    table, cut = panel([total]), Cut(observed, horizon, split="time", validation=validation, test=test)
+    spans = {part: cut.spans(table, part)[0][1:] for part in (*PARTS, "train+validation")}
+    begin = total - test
+    assert spans["test"] == (max(begin - observed, 0), total)
+    assert spans["train+validation"] == (0, begin)
+    assert spans["train"][1] == round((1 - validation) * begin)
+    assert spans["validation"] == (max(spans["train"][1] - observed, 0), begin)
+
+
+def test_sequences_with_dates_share_the_time_of_the_cutoff():
+    days = 86400.0 * np.arange(30)
+    parts = {"whole": slice(0, 30), "early": slice(0, 24), "late": slice(12, 30), "gaps": slice(0, 30, 2)}
+    for kind, shares in (("dates", True), ("numbers", False)):
+        series = [Series(name, np.zeros((len(days[part]), 1)), days[part]) for name, part in parts.items()]
+        table = Panel(series, COLUMNS, calendar=Calendar(kind))
+        cut = Cut(2, 1, split="time", test=10)
+        for (_, _, end), sequence in zip(cut.spans(table, "train+validation"), series, strict=True):
+            begin = np.searchsorted(sequence.times, days[20]) if shares else len(sequence) - 10
+            assert end == begin
+        data = PanelData("a", table, PanelSchema.from_data(table, cut))
+        assert data.cutoff == ("1970-01-21" if shares else "10 steps to the end")
+        assert data.before(4).cutoff == ("1970-01-27" if shares else "4 steps to the end")
+    clocks = [Series(str(n), np.zeros((30, 1)), days + 3600 * n) for n in range(3)]  # no common times
+    assert begin_of(Panel(clocks, COLUMNS, calendar=Calendar("dates")), 10) is None
+
+
+def test_windows_after_successive_cutoffs_are_those_of_the_whole_test_part():
+    table = panel([60, 47, 21])
+    data = PanelData("a", table, PanelSchema.from_data(table, Cut(5, 3, split="time", stride=2)))
+    whole = data.before(24).windows("test").keys
+    parts = [data.before(steps).following(6).keys for steps in (24, 18, 12, 6)]
+    assert sorted(key for part in parts for key in part) == sorted(whole)
+    for steps, part in zip((24, 18, 12, 6), parts, strict=True):
+        lengths = {sequence.name: len(sequence) for sequence in table}
+        assert {lengths[name] - start - 5 - steps for _, name, start in part} <= {0, -2, -4}
+    with pytest.raises(ValueError, match="has no test window that begins within 0 steps of 20 steps to the end"):
+        data.before(20).following(0)
+    with pytest.raises(ValueError, match=r"test is the share 0\.2, which has no cutoff"):
+        data.following(6)
+
+
+def test_units_are_from_the_steps_before_a_cutoff():
+    values = np.concatenate([np.random.default_rng(0).normal(size=40), np.full(20, 1e3)])[:, None]
+    data = PanelData.of([values], cut=Cut(4, 2, split="time", test=0.1, validation=0))
+    assert data.before(20).schema.means["x0"] == pytest.approx(values[:40].mean())
+    assert data.schema.means["x0"] > 100
+
+
 def test_too_few_sequences_or_groups_to_split_are_an_error():
     with pytest.raises(ValueError, match=r'has 2 sequences, too few .* split="time"'):
         Cut(3, 2).starts(panel([50, 50]), "train")
@@ -107,6 +159,7 @@ def test_too_few_sequences_or_groups_to_split_are_an_error():
         ({"validation": 0.5, "test": 0.5}, "their sum must be below 1"),
         ({"observed": 0, "horizon": 1}, "observed is 0; it must be at least 1"),
         ({"test": 1.5}, "test is 1.5; it must be between 0 and 1"),
+        ({"observed": 3, "horizon": 1, "test": 12}, "test is 12 steps and split 'sequence'; give a share below 1"),
     ],
 )
 def test_contradictory_cuts_are_an_error(options, message):

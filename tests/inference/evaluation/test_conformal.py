@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 import dvae
 from dvae import ArrayWindows
-from dvae.inference.evaluation.conformal import PredictionBands, conformal_bands, quantile
+from dvae.inference.evaluation.conformal import PredictionBands, adaptive_factors, conformal_bands, quantile
 from dvae.inference.evaluation.evaluate import evaluate
 from dvae.inference.evaluation.metrics import pit_histogram, tarp_histogram
 from dvae.inference.evaluation.scores import PIT, by_step, calibrated, over_horizon, tarp
@@ -191,3 +193,143 @@ def test_calibration_is_computed_and_drawn_for_every_frame_of_the_horizon(fitted
         by_step(PIT, [6])[0].function(draw(8, 19, 4, 2), draw(8, 4, 2), {}, torch.arange(8))
     with pytest.raises(KeyError, match="evaluate with"):
         replace(result, rows={}).plot_horizon()
+
+
+# ------------------------------------------------------------------------------------------------------- split by time
+
+LEVEL, RATE = 0.9, 0.2
+
+
+def origins_of(count, series=1, delay=1):
+    """Return times (N, 2) of windows of several series at each origin, and the origin of every window."""
+    origin = torch.arange(count).repeat_interleave(series)
+    return torch.stack([origin, origin + delay], 1).double(), origin
+
+
+@given(st.integers(0, 10**6), st.integers(1, 6), st.integers(1, 3), st.floats(0.02, 1.0))
+def test_the_mean_outside_is_bounded_for_any_data(seed, delay, series, rate):
+    """The scores have jumps, and some are larger because the earlier ones were small."""
+    random, count, (least, most) = np.random.default_rng(seed), 60, (0.2, 5.0)
+    jumps = np.repeat(random.uniform(np.log(least), np.log(most), 12), 5)
+    scores = np.exp(jumps + random.uniform(-1, 1, (series, count)).cumsum(1) * random.integers(0, 2)).clip(least, most)
+    origins, _ = origins_of(count, series, delay)
+    distances = torch.from_numpy(scores.T.reshape(-1, 1))
+    factor, _ = adaptive_factors(distances, origins, LEVEL, rate, torch.ones(1, dtype=torch.float64))
+    mean = float((distances > factor).double().mean())
+    # at an origin, the futures of `delay` origins are incomplete, its own included
+    step = rate / math.sqrt(delay)
+    assert mean <= 1 - LEVEL + (math.log(most) + delay * step) / (step * count) + 1e-9
+    assert mean >= 1 - LEVEL - (delay * step - math.log(least)) / (step * count) - 1e-9
+
+
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_a_band_depends_only_on_futures_that_are_complete_at_its_origin(seed, delay):
+    random, (origins, origin) = np.random.default_rng(seed), origins_of(30, 2, delay)
+    order = torch.from_numpy(random.permutation(60))  # windows may be listed in any order
+    distances = torch.from_numpy(random.exponential(size=(60, 2)))
+    now = int(random.integers(30))
+    changed = torch.where(
+        (origin + delay > now)[:, None], torch.from_numpy(random.exponential(size=(60, 2))), distances
+    )
+    first, again = (adaptive_factors(each[order], origins[order], 0.5, RATE)[0] for each in (distances, changed))
+    known = origin[order] <= now
+    assert torch.equal(first[known], again[known])
+    assert first[origin[order] >= delay].isfinite().all()  # a level of 0.5 needs one origin
+    assert first[origin[order] < delay].isinf().all()
+
+
+def scores_of(kind, count, series, seed):
+    """Return absolute errors (count, series), whose distribution changes over time."""
+    random, time = np.random.default_rng(seed), np.arange(count)[:, None] / count
+    errors = random.standard_normal((count, series))
+    if kind == "correlated":
+        errors = np.sqrt(0.7) * random.standard_normal((count, 1)) + np.sqrt(0.3) * errors
+    scale = 1 + 3 * time if kind == "drift" else 1.0
+    return np.abs(scale * errors + 3 * (time > 0.5) * (kind == "shift"))
+
+
+@pytest.mark.parametrize(("kind", "fixed_holds"), [("exchangeable", 1), ("correlated", 1), ("drift", 0), ("shift", 0)])
+@pytest.mark.parametrize("delay", [1, 4])
+def test_adaptive_bands_hold_their_level_where_fixed_ones_fail(kind, fixed_holds, delay):
+    count, series, first, shares, fixed_shares = 600, 5, 50, [], []
+    origins, origin = origins_of(count, series, delay)
+    later = origin >= first
+    for seed in range(8):
+        scores = torch.from_numpy(scores_of(kind, count, series, seed).reshape(-1, 1))
+        factor, _ = adaptive_factors(scores, origins, LEVEL, RATE)
+        fixed = quantile(scores[~later], origin[~later], LEVEL)
+        for parts, each in ((shares, factor), (fixed_shares, fixed.expand(factor.shape))):
+            parts.append(float((scores <= each)[later].double().mean()))
+    mean, error = rate(np.array(shares))
+    ratio = {"drift": 4, "shift": 3}.get(kind, 1)  # of the largest quantile to the first
+    step = RATE / math.sqrt(delay)
+    assert abs(mean - LEVEL) <= error + (math.log(ratio) + delay * step) / (step * (count - first))
+    fixed_mean, fixed_error = rate(np.array(fixed_shares))
+    assert (abs(fixed_mean - LEVEL) <= fixed_error + 0.03) == bool(fixed_holds)
+
+
+@pytest.fixture(scope="module")
+def panel():
+    """Return a panel whose scale grows threefold, divided by time, and a model with the first scale."""
+    random, time = np.random.default_rng(0), np.linspace(0, 1, 420)[:, None]
+    arrays = [(1 + 2 * time) * random.standard_normal((420, 2)) for _ in range(4)]
+    arrays[0][::7, 1] = np.nan
+    cut = dvae.tables.Cut(4, 3, split="time", validation=0.3, test=0.6)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = dvae.linear_gaussian_surrogate("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 2}, 7)
+    return model, dvae.tables.PanelData.of(arrays, cut=cut)
+
+
+def test_bands_of_a_split_by_time_continue_over_the_test_windows(panel, tmp_path):
+    model, data = panel
+    bands = conformal_bands(model, data.windows("validation"), samples=30, progress=False)
+    assert bands.rate == RATE
+    assert "origins" in str(bands)
+    bands.save(tmp_path / "bands.json")
+    again = PredictionBands.load(tmp_path / "bands.json")
+    test = data.windows("test")
+    coverage = again.coverage(model, test, progress=False)["model"]
+    fixed = replace(bands, rate=0.0).coverage(model, test, progress=False)["model"]
+    count = len(test.origins[:, 0].unique())
+    for region in ("number", "step", "future"):
+        name = f"calibrated 90 %, {region}"
+        assert abs(coverage[name].mean - LEVEL) < (math.log(3) + RATE) / (RATE * count) + 0.01, region
+        assert fixed[name].mean < coverage[name].mean - 0.03, region
+    widths = [coverage[f"width calibrated 90 %, {region}"].mean for region in ("number", "step", "future")]
+    assert widths == sorted(widths)
+    document = bands.document()
+    del document["attributes"]["rate"]  # a file of an older version
+    assert PredictionBands.of(document).rate == 0
+
+
+def test_successive_windows_calibrate_as_one(panel):
+    _, data = panel
+    windows, train = data.windows("validation"), data.windows("train")
+    early = [n for n, (_, _, start) in enumerate(windows.keys) if start < 100]
+    late = [n for n in range(len(windows)) if n not in early]
+    parts = [windows.subset(early), windows.subset(late)]
+    options = {"residuals": train, "progress": False}
+    whole, pooled = (conformal_bands("last value", each, **options) for each in (windows, parts))
+    for region, factor in whole.factors.items():
+        np.testing.assert_allclose(pooled.factors[region], factor)
+    with pytest.raises(ValueError, match="expected one model for each of 2 windows, got 1"):
+        conformal_bands([panel[0]], parts)
+
+
+def test_bands_of_a_split_by_time_state_what_they_need(panel):
+    model, data = panel
+    windows = data.windows("validation")
+    few = windows.subset([n for n, (_, _, start) in enumerate(windows.keys) if start < windows.keys[0][2] + 3])
+    count = len(few.origins[:, 0].unique())
+    with pytest.raises(ValueError, match=f"need at least 9 origins .* got {count}; use more, or a level of at most"):
+        conformal_bands(model, few, samples=5, progress=False)
+    with pytest.raises(ValueError, match="`groups` only if they are not divided by time"):
+        conformal_bands(model, windows, groups=["a"] * len(windows))
+    with pytest.raises(ValueError, match="windows of one kind"):
+        conformal_bands(model, [windows, data.windows("all")])
+    with pytest.raises(ValueError, match="rate is 0; it must be"):
+        conformal_bands(model, windows, rate=0)
+    bands = conformal_bands(model, windows, samples=5, progress=False)
+    with pytest.raises(ValueError, match="ArrayWindows, which have no `origins`"):
+        bands.coverage(model, ArrayWindows(torch.zeros(3, 7, 2), 4), progress=False)
