@@ -91,7 +91,7 @@ class LikelihoodMethod(Method):
             reference point is closest to the future in training windows (`PanelSchema.preferred`).
         scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
-            ignore it. None: 1 for data with a horizon and 0 for others.
+            ignore it. None: 1 for data with a horizon that are not a table, and 0 for others.
     """
 
     without_covariates: ClassVar[tuple[str, ...]] = ()

@@ -84,7 +84,7 @@ def test_scales_and_levels_that_differ_are_named():
     for values in (sizes * noise(6, 50, 1), sizes + 0.01 * noise(6, 50, 1)):
         (text,) = found(values)
         assert "the scale or level differs between sequences, of 'x0' by a factor of" in text
-        assert "--level series" in text
+        assert "--units series" in text
     (text,) = found(sizes * noise(6, 50, 1), (Column("x0", family="fixed"),))
     assert "take 'real'" in text
     assert not found(np.geomspace(1, 5, 6)[:, None, None] * noise(6, 50, 1))
