@@ -194,7 +194,11 @@ class PanelWindows:
         except ValueError:
             return None
         count = min(len(windows), max(LOADED // ((self.length or 1) * self.schema.sizes["x"]), 1))
-        return windows if count == len(windows) else windows.subset(np.linspace(0, len(windows) - 1, count).astype(int))
+        return (
+            windows
+            if count == len(windows)
+            else windows.subset(np.linspace(0, len(windows) - 1, count).astype(int).tolist())
+        )
 
     def histories(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the targets (S, D) of all sequences, one after another, and the steps that a forecast may use.

@@ -90,9 +90,10 @@ class Part:
         names = [name for _, name, _ in windows.keys] if isinstance(windows, HeldOutWindows) else [""] * len(x)
         return cls(x, names, values, begin, end, batch["c"].double() if "c" in batch else None)
 
-    def thinned(self, most: int) -> Part:
-        """Return at most `most` windows, evenly spaced."""
-        rows = torch.linspace(0, len(self.x) - 1, min(most, len(self.x)), dtype=torch.float64).round().long()
+    def thinned(self, most: int, rows: Tensor | None = None) -> Part:
+        """Return at most `most` windows, evenly spaced among all or the given ones."""
+        rows = torch.arange(len(self.x)) if rows is None else rows
+        rows = rows[torch.linspace(0, len(rows) - 1, min(most, len(rows)), dtype=torch.float64).round().long()]
         names, context = (
             [self.names[row] for row in rows.tolist()],
             None if self.context is None else self.context[rows],
@@ -344,9 +345,11 @@ class Baselines:
         """Return draws of exponential smoothing with damped trend, and with a season if there is one, plus errors.
 
         Each series and column is fitted once, to the steps before its first forecast, and smoothed up to the others.
-        The errors are of `ERRORS` training windows.
+        The errors are of `ERRORS` training windows among the half with the longest past, as forecasts have.
         """
-        draws = replace(self, training=self.training.thinned(ERRORS))._with_errors(self._smoothed)
+        training = self.training
+        longest = (training.end - training.begin).argsort(stable=True)[len(training.x) // 2 :]
+        draws = replace(self, training=training.thinned(ERRORS, longest))._with_errors(self._smoothed)
         return lambda part: torch.where(self._numbers, draws(part), self._own_past(part))
 
     def _smoothed(self, part: Part) -> Tensor:
@@ -357,8 +360,8 @@ class Baselines:
                 key = (name, begin, d) if part is self.held else (row, d)
                 start, fitted = fits.get(key, (max(begin, end - STEPS), None))
                 past = part.values[start:end, d, None] - self._typical[d]
-                past = (interpolate_missing(past, ~past.isnan()) + self._typical[d]).flatten().numpy()
-                means[row, :, d], fitted = smoothed(past, self.season, self._horizon, fitted)
+                filled = (interpolate_missing(past, ~past.isnan()) + self._typical[d]).flatten()
+                means[row, :, d], fitted = smoothed(filled.numpy(), self.season, self._horizon, fitted)
                 fits[key] = start, fitted
         return means
 

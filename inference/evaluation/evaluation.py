@@ -197,9 +197,10 @@ class Evaluation(Result):
     @property
     def verdicts(self) -> list[str]:
         """Sentences on the models that do not beat the best reference row by two standard errors."""
-        sentences, best, score = [], self.best_reference, self.headline
-        models = [name for name, row in self.rows.items() if row.equations and score in row.cluster_means]
-        for name in models if best and score else ():
+        sentences, best, score = list[str](), self.best_reference, self.headline
+        if best is None or score is None:
+            return []
+        for name in [name for name, row in self.rows.items() if row.equations and score in row.cluster_means]:
             difference, values = self.difference(name, best, score), f"{score} {self[name][score]}"
             values = f"{values} against {self[best][score]}"
             if difference.mean > 2 * difference.standard_error:
