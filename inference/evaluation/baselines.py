@@ -40,7 +40,7 @@ from torch.nn.functional import pad
 
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, interpolate_missing
-from .regressions import LEAST, autoregression, autoregressive_means, carried, complete, negative_binomial, smoothed
+from .regressions import LEAST, autoregression, autoregressive_means, carried, fill_missing, negative_binomial, smoothed
 
 Forecaster = Callable[[slice], Tensor]
 """Function from a slice of windows to forecasts (K, B, H, D)."""
@@ -245,7 +245,7 @@ class Baselines:
         (held, training), past = (self._changes(part)[:, None] for part in (self.held, self.training)), self.observed
         grown, growths = (growth(part) if growth else torch.ones(1) for part in (self.training, self.held))
         errors = (self.training.x[:, past:] - rule(self.training)) / training / grown
-        errors = complete(torch.where(self._numbers, errors, 0.0), self.seed).nan_to_num()
+        errors = fill_missing(torch.where(self._numbers, errors, 0.0), self.seed).nan_to_num()
         point, (order, low, count) = rule(self.held).expand(-1, self._horizon, -1), self._donors
         growths = growths.expand_as(point)
 
@@ -311,7 +311,7 @@ class Baselines:
         begin, length = self.held.begin[part, None], (self.held.end - self.held.begin)[part, None]
         chance = torch.rand(self.samples, *length.shape, generator=self._generator(part), dtype=torch.float64)
         places = begin + ((chance * length).long() + torch.arange(self._horizon)) % length
-        draws = complete(self.held.values[places], self.seed)
+        draws = fill_missing(self.held.values[places], self.seed)
         return self.scale.inverse(torch.where(draws.isnan(), self._last(self.held)[part], draws))
 
     # -------------------------------------------------------------------------------------------------- autoregression

@@ -19,7 +19,7 @@ from ...data.sequences import (
 from ...options import nearest
 from .baselines import MOST, Baselines, Forecaster, Part, Scale
 from .evaluation_windows import EvaluationWindows
-from .regressions import complete
+from .regressions import fill_missing
 
 USUAL = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
 """Default reference rows of windows that name none."""
@@ -306,7 +306,7 @@ class References:
         futures = interpolate_missing(training, gaps)[:, self.held.observed :]
         if gaps is not None and self._is_table:  # an interpolated value may be invalid, such as half a count
             given = torch.where(gaps, training, torch.nan)[:, self.held.observed :]
-            futures = torch.where((filled := complete(given)).isnan(), futures, filled)
+            futures = torch.where((filled := fill_missing(given)).isnan(), futures, filled)
         return self.samples, climatology(futures, len(self.held.x), self.samples, self.seed)
 
     def _neighbours(self) -> tuple[int, Forecaster]:

@@ -23,7 +23,7 @@ def carried(x: Tensor) -> Tensor:
     return x.gather(1, torch.where(x.isnan(), 0, steps).cummax(1).values)
 
 
-def complete(errors: Tensor, seed: int = 0) -> Tensor:
+def fill_missing(errors: Tensor, seed: int = 0) -> Tensor:
     """Return errors `(M, ...)` with missing ones (NaN) replaced by those of another row at the same place, if any."""
     if not errors.isnan().any():
         return errors

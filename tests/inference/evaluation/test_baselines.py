@@ -66,7 +66,8 @@ def test_intervals_cover_at_their_level(kind, split):
     simulate, family, season, names = SIMULATED[kind]
     if "ETS" in names:
         pytest.importorskip("statsmodels")
-    names = [name for name in names if split == "time" or name != "climatology by series"]  # it sees 20 steps
+    if split == "sequence":  # 20 steps are few for the second, and the first is slow
+        names = [name for name in names if name not in ("ETS", "climatology by series")]
     data = table(simulate(np.random.default_rng(1), count=90), family, split=split, season=season, test=0.3)
     options = {"references": names, "samples": 99, "scores": calibrated, "progress": False}
     scores = dvae.evaluate({}, data, **options)

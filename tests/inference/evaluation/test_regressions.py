@@ -10,7 +10,7 @@ from dvae.inference.evaluation.regressions import (
     autoregression,
     autoregressive_means,
     carried,
-    complete,
+    fill_missing,
     negative_binomial,
     smoothed,
 )
@@ -114,8 +114,8 @@ def test_missing_entries_are_carried_forward_or_completed_from_other_rows():
     assert carried(x)[0, 0].isnan()
     errors = torch.randn(50, 4, generator=torch.Generator().manual_seed(0))
     missing = torch.rand(50, 4, generator=torch.Generator().manual_seed(1)) < 0.5
-    filled = complete(torch.where(missing, nan, errors))
+    filled = fill_missing(torch.where(missing, nan, errors))
     assert torch.equal(filled[~missing], errors[~missing])
     for column in range(4):
         assert {*filled[:, column].tolist()} == {*errors[~missing[:, column], column].tolist()}
-    assert complete(torch.full((3, 2), nan)).isnan().all()
+    assert fill_missing(torch.full((3, 2), nan)).isnan().all()
