@@ -102,7 +102,7 @@ class Part:
 
     @cached_property
     def means(self) -> tuple[Tensor, Tensor]:
-        """Number and mean `(N, D)` of the observed values before the forecasts; the mean is 0 if there are none."""
+        """Number and mean `(N, D)` of the observed values before the forecasts; the mean of no values is 0."""
         seen, centre = ~self.values.isnan(), self.values.nanmean(0).nan_to_num()  # for precision; it cancels
         sums = [pad(each.cumsum(0), (0, 0, 1, 0)) for each in (seen.double(), (self.values - centre).nan_to_num())]
         number, total = (each[self.end] - each[self.begin] for each in sums)
@@ -112,7 +112,7 @@ class Part:
     def ends(self) -> tuple[Tensor, Tensor]:
         """Indices `(N, D)` in `values` of the first and the last observed value before the forecasts.
 
-        If there is none, the first index is above the last one.
+        If no value is observed, the first index is above the last one.
         """
         index, seen = torch.arange(len(self.values))[:, None], ~self.values.isnan()
         after = torch.where(seen, index, len(index) - 1).flip(0).cummin(0).values.flip(0)[self.begin]
@@ -166,7 +166,7 @@ class Baselines:
     season: int | None = None
 
     def missing_requirement(self, name: str) -> str:
-        """Return what a method still requires; empty if it is available."""
+        """Return what a method requires; empty if it is available."""
         if self._numbers.logical_not().all() and name in ("AR", "ETS"):
             return "a column of numbers"
         if name == "GLM" and not self.scale.which(*COUNTS).any():
@@ -307,7 +307,7 @@ class Baselines:
     # ------------------------------------------------------------------------------------------------- own past
 
     def _own_past(self, part: slice) -> Tensor:
-        """Draw consecutive steps of a window's own past; a missing value is replaced by that of another draw."""
+        """Draw consecutive steps of a window's own past; a value of another draw replaces a missing one."""
         begin, length = self.held.begin[part, None], (self.held.end - self.held.begin)[part, None]
         chance = torch.rand(self.samples, *length.shape, generator=self._generator(part), dtype=torch.float64)
         places = begin + ((chance * length).long() + torch.arange(self._horizon)) % length

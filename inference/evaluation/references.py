@@ -250,7 +250,7 @@ class References:
 
     @cached_property
     def _source(self) -> Any:
-        """Training windows: the given ones, or those of the same table."""
+        """Training windows: the given ones, or else the training part of the same table."""
         if self.training is None:
             return getattr(self.held.windows, "training", None)
         return take_split(self.training, "train")
