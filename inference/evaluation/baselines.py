@@ -49,12 +49,12 @@ COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
 LABELS = ("binary", "category")
 OWN = 20
 """Smallest number of training windows of a series whose errors are used alone."""
-FITS, STEPS = 500, 300
+FITS, STEPS = 600, 300
 """Largest numbers of fits of exponential smoothing, and of steps before the first forecast that a fit reads."""
 ERRORS = 100
 """Number of training windows that errors of exponential smoothing are from; each needs a fit."""
-MOST = 20_000
-"""Largest number of training windows that parameters are estimated from, evenly spaced."""
+MOST, FEWEST = 4_000_000, 200
+"""Largest number of values in the training windows that parameters are from, unless these are `FEWEST` windows."""
 Rule = Callable[["Part"], Tensor]
 """Function from windows to values (N, 1 or H, D) on the additive scale."""
 
@@ -84,8 +84,8 @@ class Part:
         x = scale.forward(batch.mask_to_nan().double())
         begin = torch.arange(len(x)) * x.shape[1]
         values, begin, end = x.flatten(0, 1), begin, begin + observed
-        if hasattr(windows, "histories"):
-            values, begin, end = windows.histories()
+        if hasattr(windows, "histories") and (histories := windows.histories()) is not None:
+            values, begin, end = histories
             values = scale.forward(values)
         names = [name for _, name, _ in windows.keys] if isinstance(windows, HeldOutWindows) else [""] * len(x)
         return cls(x, names, values, begin, end, batch["c"].double() if "c" in batch else None)
@@ -173,12 +173,15 @@ class Baselines:
             return "a column of counts"
         if name == "ETS":
             shortest = int((self.held.end - self.held.begin).min())
-            fits = len({*zip(self.held.names, self.held.begin.tolist(), strict=True)}) * int(self._numbers.sum())
+            fits = len({*zip(self.held.names, self.held.begin.tolist(), strict=True)}) + min(
+                ERRORS, len(self.training.x)
+            )
+            fits *= int(self._numbers.sum())
             if find_spec("statsmodels") is None:
                 return "statsmodels (pip install 'pyro-dvae[series]')"
             if shortest < LEAST:
                 return f"at least {LEAST} steps before each forecast, and the shortest past has {shortest}"
-            return f"{fits} fits, more than {FITS}" if fits > FITS else ""
+            return f"{fits} fits, and at most {FITS} are made" if fits > FITS else ""
         return ""
 
     def __getitem__(self, name: str) -> Forecaster:

@@ -17,7 +17,7 @@ from ...data.sequences import (
     take_split,
 )
 from ...options import nearest
-from .baselines import MOST, Baselines, Forecaster, Part, Scale
+from .baselines import FEWEST, MOST, Baselines, Forecaster, Part, Scale
 from .evaluation_windows import EvaluationWindows
 from .regressions import fill_missing
 
@@ -282,7 +282,8 @@ class References:
         batch = self._training_batch.map(lambda values: values[:, :frames] if values.ndim == 3 else values)
         if (steps := batch["x"].shape[1]) < frames:
             raise ValueError(f"training windows have {steps} steps, expected the {frames} of the windows to forecast")
-        training = Part.of(self._source, batch, held.observed, scale).thinned(MOST)
+        training = Part.of(self._source, batch, held.observed, scale)
+        training = training.thinned(max(MOST // batch["x"][0].numel(), FEWEST))
         season = self._period if 1 < (self._period or 0) <= held.observed else None
         options = (held.observed, self.samples, self.seed, season)
         return Baselines(Part.of(held.windows, held.batch, held.observed, scale), training, scale, *options)

@@ -24,7 +24,7 @@ def carried(x: Tensor) -> Tensor:
 
 
 def fill_missing(errors: Tensor, seed: int = 0) -> Tensor:
-    """Return errors `(M, ...)` whose missing entries (NaN) are replaced by an entry of another row at the same place."""
+    """Return errors `(M, ...)` with missing entries (NaN) replaced by an entry of another row at the same place."""
     if not errors.isnan().any():
         return errors
     order = torch.randperm(len(errors), generator=torch.Generator().manual_seed(seed))
