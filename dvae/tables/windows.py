@@ -194,19 +194,15 @@ class PanelWindows:
         except ValueError:
             return None
         count = min(len(windows), max(LOADED // ((self.length or 1) * self.schema.sizes["x"]), 1))
-        return (
-            windows
-            if count == len(windows)
-            else windows.subset(np.linspace(0, len(windows) - 1, count).astype(int).tolist())
-        )
+        return windows.subset(np.linspace(0, len(windows) - 1, count).round().astype(int).tolist())
 
     def histories(self) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return the targets (S, D) of all sequences, one after another, and the steps that a forecast may use.
 
         Returns:
-            None if the targets are too many to load. Otherwise the targets, NaN where missing; and for each listed window
-            the first step that its forecast may use, and its first future step (N,). With a split by time, the first one
-            is the start of the sequence, which training data contain. Otherwise, it is the first observed step.
+            None if the targets are too many to load. Otherwise the targets, NaN where missing; and for each window the
+            first step that its forecast may use, and its first future step (N,). With a split by time, the first one is
+            the start of the sequence, which training data contain. Otherwise, it is the first observed step.
         """
         if sum(map(len, self._values)) * self.schema.sizes["x"] > LOADED:
             return None
