@@ -84,7 +84,8 @@ class Part:
         x = scale.forward(batch.mask_to_nan().double())
         begin = torch.arange(len(x)) * x.shape[1]
         values, begin, end = x.flatten(0, 1), begin, begin + observed
-        if hasattr(windows, "histories") and (histories := windows.histories()) is not None:
+        is_table = hasattr(windows, "histories") and windows.protocol.observed == observed
+        if is_table and (histories := windows.histories()) is not None:
             values, begin, end = histories
             values = scale.forward(values)
         names = [name for _, name, _ in windows.keys] if isinstance(windows, HeldOutWindows) else [""] * len(x)
@@ -402,4 +403,6 @@ class Baselines:
         terms = [((total + pooled) / (count + 1)).log()[:, None].expand(-1, self._horizon) for total, count in sums]
         terms += [((self._seasonal(part)[..., d] + pooled) / 2).log()] if self.season else []
         x = torch.stack([torch.ones_like(terms[0]), *terms], -1)
-        return x if part.context is None else torch.cat([x, part.context[:, self.observed :]], -1)
+        if part.context is None or self.held.context is None or self.training.context is None:
+            return x
+        return torch.cat([x, part.context[:, self.observed :]], -1)

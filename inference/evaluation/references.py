@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import torch
@@ -273,7 +273,8 @@ class References:
         } | {name: partial(self._drawn, name) for name in sorted(drawn)}
 
     def _drawn(self, name: str) -> tuple[int, Forecaster]:
-        return self.samples, self._baselines[name]
+        make = cache(lambda: self._baselines[name])  # on the first forecast, when the progress bar is shown
+        return self.samples, lambda part: make()(part)
 
     @cached_property
     def _baselines(self) -> Baselines:
