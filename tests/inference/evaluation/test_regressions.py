@@ -35,7 +35,7 @@ def test_autoregression_recovers_its_coefficients(coefficients, season):
     for lag, estimate in zip(lags, estimates[:, 0].tolist(), strict=False):
         assert estimate == pytest.approx(coefficients.get(lag, 0.0), abs=0.05), lag
     assert coefficients.keys() <= {*lags}
-    assert max(lags) <= (season + 1 if season else len(coefficients) + 1)
+    assert max(lags) <= (2 * season if season else len(coefficients) + 1)
 
 
 def test_means_follow_the_recursion():
