@@ -32,7 +32,7 @@ GROUPED = 8
 AT_ONCE = 64
 """Windows that are forecast or imputed at once."""
 LOADED = 2**28
-"""Largest number of values of training windows that reference forecasts load."""
+"""Largest number of values of training windows, and of whole sequences, that reference forecasts load."""
 NAMED = 10
 """Maximum number of sequences without a window that messages name."""
 
@@ -207,16 +207,18 @@ class PanelWindows:
         except ValueError:
             return None
         count = min(len(windows), max(LOADED // ((self.length or 1) * self.schema.sizes["x"]), 1))
-        return windows if count == len(windows) else windows.subset(np.linspace(0, len(windows) - 1, count).astype(int))
+        return windows.subset(np.linspace(0, len(windows) - 1, count).round().astype(int).tolist())
 
-    def histories(self) -> tuple[Tensor, Tensor, Tensor]:
+    def histories(self) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return the targets (S, D) of all sequences, one after another, and the steps that a forecast may use.
 
         Returns:
-            The targets, NaN where missing; and for each listed window the first step that its forecast may use, and its
-            first future step (N,). With a split by time, the first one is the start of the sequence, which training
-            data contain. Otherwise, it is the first observed step.
+            None if the targets are too many to load. Otherwise the targets, NaN where missing; and for each window the
+            first step that its forecast may use, and its first future step (N,). With a split by time, the first one is
+            the start of the sequence, which training data contain. Otherwise, it is the first observed step.
         """
+        if sum(map(len, self._values)) * self.schema.sizes["x"] > LOADED:
+            return None
         ranges, starts = self._windows
         values = torch.from_numpy(np.concatenate([self.schema.encoded(values) for values in self._values])).double()
         end = self._first[ranges] + starts + (self.schema.cut.observed or 0)

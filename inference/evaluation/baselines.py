@@ -40,7 +40,7 @@ from torch.nn.functional import pad
 
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, interpolate_missing
-from .regressions import LEAST, autoregression, autoregressive_means, carried, complete, negative_binomial, smoothed
+from .regressions import LEAST, autoregression, autoregressive_means, carried, fill_missing, negative_binomial, smoothed
 
 Forecaster = Callable[[slice], Tensor]
 """Function from a slice of windows to forecasts (K, B, H, D)."""
@@ -49,12 +49,12 @@ COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
 LABELS = ("binary", "category")
 OWN = 20
 """Smallest number of training windows of a series whose errors are used alone."""
-FITS, STEPS = 500, 300
+FITS, STEPS = 600, 300
 """Largest numbers of fits of exponential smoothing, and of steps before the first forecast that a fit reads."""
 ERRORS = 100
 """Number of training windows that errors of exponential smoothing are from; each needs a fit."""
-MOST = 20_000
-"""Largest number of training windows that parameters are estimated from, evenly spaced."""
+MOST, FEWEST = 4_000_000, 200
+"""Largest number of values in the training windows that parameters are from, unless these are `FEWEST` windows."""
 Rule = Callable[["Part"], Tensor]
 """Function from windows to values (N, 1 or H, D) on the additive scale."""
 
@@ -84,15 +84,17 @@ class Part:
         x = scale.forward(batch.mask_to_nan().double())
         begin = torch.arange(len(x)) * x.shape[1]
         values, begin, end = x.flatten(0, 1), begin, begin + observed
-        if hasattr(windows, "histories"):
-            values, begin, end = windows.histories()
+        is_table = hasattr(windows, "histories") and windows.protocol.observed == observed
+        if is_table and (histories := windows.histories()) is not None:
+            values, begin, end = histories
             values = scale.forward(values)
         names = [name for _, name, _ in windows.keys] if isinstance(windows, HeldOutWindows) else [""] * len(x)
         return cls(x, names, values, begin, end, batch["c"].double() if "c" in batch else None)
 
-    def thinned(self, most: int) -> Part:
-        """Return at most `most` windows, evenly spaced."""
-        rows = torch.linspace(0, len(self.x) - 1, min(most, len(self.x)), dtype=torch.float64).round().long()
+    def thinned(self, most: int, rows: Tensor | None = None) -> Part:
+        """Return at most `most` windows, evenly spaced among all or the given ones."""
+        rows = torch.arange(len(self.x)) if rows is None else rows
+        rows = rows[torch.linspace(0, len(rows) - 1, min(most, len(rows)), dtype=torch.float64).round().long()]
         names, context = (
             [self.names[row] for row in rows.tolist()],
             None if self.context is None else self.context[rows],
@@ -101,7 +103,7 @@ class Part:
 
     @cached_property
     def means(self) -> tuple[Tensor, Tensor]:
-        """Number and mean `(N, D)` of the observed values before the forecasts; the mean is 0 if there are none."""
+        """Number and mean `(N, D)` of the observed values before the forecasts; the mean of no values is 0."""
         seen, centre = ~self.values.isnan(), self.values.nanmean(0).nan_to_num()  # for precision; it cancels
         sums = [pad(each.cumsum(0), (0, 0, 1, 0)) for each in (seen.double(), (self.values - centre).nan_to_num())]
         number, total = (each[self.end] - each[self.begin] for each in sums)
@@ -111,7 +113,7 @@ class Part:
     def ends(self) -> tuple[Tensor, Tensor]:
         """Indices `(N, D)` in `values` of the first and the last observed value before the forecasts.
 
-        If there is none, the first index is above the last one.
+        If no value is observed, the first index is above the last one.
         """
         index, seen = torch.arange(len(self.values))[:, None], ~self.values.isnan()
         after = torch.where(seen, index, len(index) - 1).flip(0).cummin(0).values.flip(0)[self.begin]
@@ -165,19 +167,22 @@ class Baselines:
     season: int | None = None
 
     def missing_requirement(self, name: str) -> str:
-        """Return what a method still requires; empty if it is available."""
+        """Return what a method requires; empty if it is available."""
         if self._numbers.logical_not().all() and name in ("AR", "ETS"):
             return "a column of numbers"
         if name == "GLM" and not self.scale.which(*COUNTS).any():
             return "a column of counts"
         if name == "ETS":
             shortest = int((self.held.end - self.held.begin).min())
-            fits = len({*zip(self.held.names, self.held.begin.tolist(), strict=True)}) * int(self._numbers.sum())
+            fits = len({*zip(self.held.names, self.held.begin.tolist(), strict=True)}) + min(
+                ERRORS, len(self.training.x)
+            )
+            fits *= int(self._numbers.sum())
             if find_spec("statsmodels") is None:
                 return "statsmodels (pip install 'pyro-dvae[series]')"
             if shortest < LEAST:
                 return f"at least {LEAST} steps before each forecast, and the shortest past has {shortest}"
-            return f"{fits} fits, more than {FITS}" if fits > FITS else ""
+            return f"{fits} fits, and at most {FITS} are made" if fits > FITS else ""
         return ""
 
     def __getitem__(self, name: str) -> Forecaster:
@@ -244,7 +249,7 @@ class Baselines:
         (held, training), past = (self._changes(part)[:, None] for part in (self.held, self.training)), self.observed
         grown, growths = (growth(part) if growth else torch.ones(1) for part in (self.training, self.held))
         errors = (self.training.x[:, past:] - rule(self.training)) / training / grown
-        errors = complete(torch.where(self._numbers, errors, 0.0), self.seed).nan_to_num()
+        errors = fill_missing(torch.where(self._numbers, errors, 0.0), self.seed).nan_to_num()
         point, (order, low, count) = rule(self.held).expand(-1, self._horizon, -1), self._donors
         growths = growths.expand_as(point)
 
@@ -306,11 +311,11 @@ class Baselines:
     # ------------------------------------------------------------------------------------------------- own past
 
     def _own_past(self, part: slice) -> Tensor:
-        """Draw consecutive steps of a window's own past; a missing value is replaced by that of another draw."""
+        """Draw consecutive steps of a window's own past; a value of another draw replaces a missing one."""
         begin, length = self.held.begin[part, None], (self.held.end - self.held.begin)[part, None]
         chance = torch.rand(self.samples, *length.shape, generator=self._generator(part), dtype=torch.float64)
         places = begin + ((chance * length).long() + torch.arange(self._horizon)) % length
-        draws = complete(self.held.values[places], self.seed)
+        draws = fill_missing(self.held.values[places], self.seed)
         return self.scale.inverse(torch.where(draws.isnan(), self._last(self.held)[part], draws))
 
     # -------------------------------------------------------------------------------------------------- autoregression
@@ -344,9 +349,11 @@ class Baselines:
         """Return draws of exponential smoothing with damped trend, and with a season if there is one, plus errors.
 
         Each series and column is fitted once, to the steps before its first forecast, and smoothed up to the others.
-        The errors are of `ERRORS` training windows.
+        The errors are of `ERRORS` training windows among the half with the longest past, as forecasts have.
         """
-        draws = replace(self, training=self.training.thinned(ERRORS))._with_errors(self._smoothed)
+        training = self.training
+        longest = (training.end - training.begin).argsort(stable=True)[len(training.x) // 2 :]
+        draws = replace(self, training=training.thinned(ERRORS, longest))._with_errors(self._smoothed)
         return lambda part: torch.where(self._numbers, draws(part), self._own_past(part))
 
     def _smoothed(self, part: Part) -> Tensor:
@@ -357,8 +364,8 @@ class Baselines:
                 key = (name, begin, d) if part is self.held else (row, d)
                 start, fitted = fits.get(key, (max(begin, end - STEPS), None))
                 past = part.values[start:end, d, None] - self._typical[d]
-                past = (interpolate_missing(past, ~past.isnan()) + self._typical[d]).flatten().numpy()
-                means[row, :, d], fitted = smoothed(past, self.season, self._horizon, fitted)
+                filled = (interpolate_missing(past, ~past.isnan()) + self._typical[d]).flatten()
+                means[row, :, d], fitted = smoothed(filled.numpy(), self.season, self._horizon, fitted)
                 fits[key] = start, fitted
         return means
 
@@ -396,4 +403,6 @@ class Baselines:
         terms = [((total + pooled) / (count + 1)).log()[:, None].expand(-1, self._horizon) for total, count in sums]
         terms += [((self._seasonal(part)[..., d] + pooled) / 2).log()] if self.season else []
         x = torch.stack([torch.ones_like(terms[0]), *terms], -1)
-        return x if part.context is None else torch.cat([x, part.context[:, self.observed :]], -1)
+        if part.context is None or self.held.context is None or self.training.context is None:
+            return x
+        return torch.cat([x, part.context[:, self.observed :]], -1)

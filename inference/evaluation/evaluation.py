@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 SKILL = Metric("", "free-running", "higher")
 HEADLINES = ("CRPS", "energy score")
 """Proper scores that skill is computed from; the first one that an evaluation has is used."""
-FIRST = (*HEADLINES, "ADE", "FDE", "coverage 90 %", "width 90 %", "ELBO")
-"""Scores that a table shows first if it has columns for some only."""
+FIRST = ("skill", *HEADLINES, "coverage 90 %", "width 90 %")
+"""Scores that a table shows, with the next ones, if it has columns for some only."""
 ARROWS = {"lower": " ↓", "higher": " ↑", "": ""}
 """Arrow for each direction that is better."""
 COLUMNS = 5
@@ -197,9 +197,10 @@ class Evaluation(Result):
     @property
     def verdicts(self) -> list[str]:
         """Sentences on the models that do not beat the best reference row by two standard errors."""
-        sentences, best, score = [], self.best_reference, self.headline
-        models = [name for name, row in self.rows.items() if row.equations and score in row.cluster_means]
-        for name in models if best and score else ():
+        sentences, best, score = list[str](), self.best_reference, self.headline
+        if best is None or score is None:
+            return []
+        for name in [name for name, row in self.rows.items() if row.equations and score in row.cluster_means]:
             difference, values = self.difference(name, best, score), f"{score} {self[name][score]}"
             values = f"{values} against {self[best][score]}"
             if difference.mean > 2 * difference.standard_error:
@@ -238,7 +239,7 @@ class Evaluation(Result):
             if name not in known:
                 raise KeyError(f"no method has a score {name!r}{nearest(name, known)}")
         if metrics is None and in_rows:
-            order = [name for name in dict.fromkeys(["skill", *FIRST, *known]) if name in known]
+            order = [name for name in dict.fromkeys([*FIRST, *known]) if name in known]
             metrics, omitted = order[:COLUMNS], order[COLUMNS:]
         table = Table(title=self._title(), caption=self._caption(metrics, omitted))
         table.add_column("", no_wrap=True)  # on a narrow terminal numbers wrap, and names do not

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import torch
@@ -17,9 +17,9 @@ from ...data.sequences import (
     take_split,
 )
 from ...options import nearest
-from .baselines import MOST, Baselines, Forecaster, Part, Scale
+from .baselines import FEWEST, MOST, Baselines, Forecaster, Part, Scale
 from .evaluation_windows import EvaluationWindows
-from .regressions import complete
+from .regressions import fill_missing
 
 USUAL = ("last value", "seasonal", "mean", "climatology", "nearest neighbours")
 """Default reference rows of windows that name none."""
@@ -250,7 +250,7 @@ class References:
 
     @cached_property
     def _source(self) -> Any:
-        """Training windows: the given ones, or those of the same table."""
+        """Training windows: the given ones, or else the training part of the same table."""
         if self.training is None:
             return getattr(self.held.windows, "training", None)
         return take_split(self.training, "train")
@@ -273,7 +273,8 @@ class References:
         } | {name: partial(self._drawn, name) for name in sorted(drawn)}
 
     def _drawn(self, name: str) -> tuple[int, Forecaster]:
-        return self.samples, self._baselines[name]
+        make = cache(lambda: self._baselines[name])  # on the first forecast, when the progress bar is shown
+        return self.samples, lambda part: make()(part)
 
     @cached_property
     def _baselines(self) -> Baselines:
@@ -282,7 +283,8 @@ class References:
         batch = self._training_batch.map(lambda values: values[:, :frames] if values.ndim == 3 else values)
         if (steps := batch["x"].shape[1]) < frames:
             raise ValueError(f"training windows have {steps} steps, expected the {frames} of the windows to forecast")
-        training = Part.of(self._source, batch, held.observed, scale).thinned(MOST)
+        training = Part.of(self._source, batch, held.observed, scale)
+        training = training.thinned(max(MOST // batch["x"][0].numel(), FEWEST))
         season = self._period if 1 < (self._period or 0) <= held.observed else None
         options = (held.observed, self.samples, self.seed, season)
         return Baselines(Part.of(held.windows, held.batch, held.observed, scale), training, scale, *options)
@@ -306,7 +308,7 @@ class References:
         futures = interpolate_missing(training, gaps)[:, self.held.observed :]
         if gaps is not None and self._is_table:  # an interpolated value may be invalid, such as half a count
             given = torch.where(gaps, training, torch.nan)[:, self.held.observed :]
-            futures = torch.where((filled := complete(given)).isnan(), futures, filled)
+            futures = torch.where((filled := fill_missing(given)).isnan(), futures, filled)
         return self.samples, climatology(futures, len(self.held.x), self.samples, self.seed)
 
     def _neighbours(self) -> tuple[int, Forecaster]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 LAGS = 8
-"""Largest order of an autoregression, which BIC selects; a season and a season plus one are added."""
+"""Largest order of an autoregression, which BIC selects; one season, one more step, and two seasons are added."""
 RIDGE = 0.1
 """Ridge of standardised regressors."""
 LEAST = 10
@@ -23,8 +23,8 @@ def carried(x: Tensor) -> Tensor:
     return x.gather(1, torch.where(x.isnan(), 0, steps).cummax(1).values)
 
 
-def complete(errors: Tensor, seed: int = 0) -> Tensor:
-    """Return errors `(M, ...)` with missing ones (NaN) replaced by those of another row at the same place, if any."""
+def fill_missing(errors: Tensor, seed: int = 0) -> Tensor:
+    """Return errors `(M, ...)` with missing entries (NaN) replaced by an entry of another row at the same place."""
     if not errors.isnan().any():
         return errors
     order = torch.randperm(len(errors), generator=torch.Generator().manual_seed(seed))
@@ -47,7 +47,7 @@ def autoregression(
     """
     y, steps = z[:, observed:], range(observed, z.shape[1])
     seen = ~y.isnan()
-    seasonal = [lag for lag in (season, season + 1) if lag <= observed] if season else []
+    seasonal = [lag for lag in (season, season + 1, 2 * season) if lag <= observed] if season else []
     number, fits = seen.sum((0, 1)).clamp(min=1), []
     for order in range(1, min(LAGS, observed) + 1):
         lags = tuple(sorted({*range(1, order + 1), *seasonal}))

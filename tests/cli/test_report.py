@@ -205,6 +205,9 @@ def test_records_of_a_run_are_reported(scored, tmp_path):
     assert "lowest" in facts or "best bound" in facts
     for row in evaluation.rows:
         assert str(evaluation[row]["ADE"]) in scores
+        assert str(evaluation.skill(row)) in scores
+    assert len(evaluation.verdicts) == 1  # of one model, which has hardly been trained
+    assert evaluation.verdicts[0] in scores
     assert "changed" not in scores
     assert json.loads((scored / "calibration.json").read_text())["calibration"]["summary"]["verdict"] in criticism
     assert "bone stretch (%)" in criticism

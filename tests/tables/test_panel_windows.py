@@ -301,3 +301,25 @@ def test_a_declared_season_is_repeated():
     assert data.whole().all()["x"].shape == (1, len(days), 1)  # a whole sequence has no season to repeat
     with pytest.raises(ValueError, match="season is 7 and observed 5; season must be at most"):
         Cut(5, 5, season=7)
+
+
+@pytest.mark.parametrize("split", ["time", "sequence"])
+def test_histories_are_what_a_forecast_may_know(split, monkeypatch):
+    series = [np.arange(40.0)[:, None] + 100 * n for n in range(6)]
+    data = PanelData.of(series, cut=Cut(6, 2, split=split))
+    windows = data.windows("test")
+    values, begin, end = windows.histories()
+    batch = windows.all()["x"]
+    for n, (_, name, start) in enumerate(windows.keys):
+        history = values[begin[n] : end[n]]
+        first = 0 if split == "time" else start
+        assert torch.equal(history, torch.from_numpy(series[int(name)][first : start + 6]))
+        assert torch.equal(history[-6:], batch[n, :6])
+    assert windows.families == ["real"]
+    assert windows.training.keys == data.windows("train").keys
+    assert data.only(["0"]).windows("all").training is None or split == "time"
+    monkeypatch.setattr("dvae.tables.windows.LOADED", 72)
+    assert windows.histories() is None
+    assert len(data.windows("test").training) == 9  # evenly thinned
+    scores = dvae.evaluate({}, data, references=["drift", "AR"], progress=False)
+    assert scores["drift"]["CRPS"].mean < 0.1

@@ -44,7 +44,7 @@ def cancellations() -> Panel:
         Column("scheduled", "known", unit="flights"),
         *(Column(name, "static", "category", classes=_classes(daily[name])) for name in ("carrier", "origin")),
     )
-    return Panel.of(daily, Columns(columns, ("series",), "date"), "cancellations")
+    return Panel.of(daily, Columns(columns, ("series",), "date", calendar=("weekday",)), "cancellations")
 
 
 def countries() -> Panel:
@@ -76,10 +76,11 @@ def housing() -> Panel:
     """
     frame = _table("ggplot2", "txhousing").drop(columns="date")
     columns = (
-        Column("sales", family="overdispersed", unit="houses"),
+        Column("sales", family="log-normal", unit="houses"),
         *_columns("past", median="US$", listings="houses", inventory="months"),
     )
-    return Panel.of(frame.assign(date=_dates(frame.assign(day=1))), Columns(columns, ("city",), "date"), "housing")
+    schema = Columns(columns, ("city",), "date", calendar=("month",))
+    return Panel.of(frame.assign(date=_dates(frame.assign(day=1))), schema, "housing")
 
 
 def ridership() -> Panel:
@@ -138,7 +139,7 @@ def weather() -> Panel:
         Column("temp", unit="°F"),
         *_columns("past", humid="%", pressure="mbar", wind_speed="mph", precip="inches"),
     )
-    schema = Columns(columns, ("origin",), "time", zone="America/New_York")
+    schema = Columns(columns, ("origin",), "time", zone="America/New_York", calendar=("hour", "day_of_year"))
     return Panel.of(regular(frame, "origin", "time", "1h"), schema, "weather")
 
 

@@ -11,6 +11,8 @@ import dvae
 from dvae import motion
 from dvae.data.batch import Batch
 from dvae.inference.evaluation.evaluate import _measures
+from dvae.inference.evaluation.evaluation_windows import prepare_windows
+from dvae.inference.evaluation.references import References
 from dvae.motion import PROTOCOLS, rotate_about_up
 
 PROTOCOL = replace(PROTOCOLS["simulated"], observed=4, predicted=6, test_stride=20, multimodal_threshold=0.5)
@@ -215,3 +217,16 @@ def test_only_windows_with_several_futures_are_scored_on_request():
     apart = motion.windows(motion.MotionSet([clips[n] for n in (0, 1, 3)], motion.WALKER), PROTOCOL, "test")
     with pytest.raises(ValueError, match="none of the 3 windows has several futures"):
         motion.several_futures(apart)
+
+
+def test_reference_rows_of_motion_are_the_last_pose_and_neighbours(walkers):
+    test, training = walkers.windows("test"), walkers.windows("train")
+    rows = References(prepare_windows(test), 3, training=training)
+    assert rows.usual == ["zero velocity", "nearest neighbours"]
+    assert list(rows.notes) == []
+    count, forecaster = rows["zero velocity"]
+    observed = test.protocol.observed
+    x = test.all()["x"][:4]
+    assert count == 1
+    torch.testing.assert_close(forecaster(slice(0, 4))[0], x[:, observed - 1 : observed].expand_as(x[:, observed:]))
+    assert "drift" not in dvae.evaluate({}, test, training_windows=training, samples=2, progress=False).rows
