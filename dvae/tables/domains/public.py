@@ -16,7 +16,6 @@ from ..columns import Column, Columns
 from ..panel import Panel
 from .published import package_folder
 
-DAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
 LAG = 14
 """Days by which the ridership of the stations lags behind the date of a row, in modeldata's Chicago."""
 FASTEST = 250.0
@@ -88,7 +87,7 @@ def ridership() -> Panel:
 
     The table has the riders of the stations 14 days before the date of a row, next to the weather and the games of that
     date. Here all refer to the same day, so that the first 14 days of riders and the last 14 days of the rest are left
-    out. Riders are in thousands; 242 values are zero, mostly of closed stations. Weekday, federal holidays of the
+    out. Riders are in thousands; 242 values are zero, mostly of closed stations. Federal holidays of the
     United States (on the days of their observance) and home games are known in advance; temperature, precipitation and
     wind are known up to the present. Away games and other columns on the weather are left out. Origin: Kuhn and Johnson
     (2020), Feature Engineering and Selection.
@@ -109,14 +108,14 @@ def ridership() -> Panel:
         ["date", *games, *(column.name for column in weather)], stations, "station", "riders"
     )
     holidays = USFederalHolidayCalendar().holidays(frame["date"].min(), frame["date"].max())
-    frame = frame.assign(weekday=frame["date"].dt.day_name(), holiday=frame["date"].isin(holidays))
+    frame = frame.assign(holiday=frame["date"].isin(holidays))
     columns = (
         Column("riders", unit="thousands"),
-        Column("weekday", "known", "category", classes=DAYS),
         *(Column(name, "known") for name in ("holiday", *games)),
         *weather,
     )
-    return Panel.of(frame, Columns(columns, ("station",), "date"), "ridership")
+    schema = Columns(columns, ("station",), "date", calendar=("weekday", "day_of_year"))
+    return Panel.of(frame, schema, "ridership")
 
 
 def weather() -> Panel:
