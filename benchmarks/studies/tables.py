@@ -90,7 +90,7 @@ def detail(cases: Mapping[str, Row], note: str) -> Table:
 
 
 def summary(available: Mapping[str, Mapping[str, Row]]) -> Table:
-    """Return a line for each table with the best simple forecast, the DVAE that validation chose, and their difference."""
+    """Return a line for each table: best simple forecast, the DVAE that validation chose, and their difference."""
     lines = []
     for name, cases in available.items():
         _, simple = rows_of(cases)

@@ -38,8 +38,6 @@ from ..factorization.notation import Factorization
 from .batch import WHOLE, Batch
 from .views import View
 
-WINDOWS = 4096
-"""Maximum number of windows from which a prior is estimated."""
 LOCATION, SCALE, STATE = "x_location", "x_scale", "x_state"
 """Names of the entries that the view adds: location and scale of each step, and the state after the last step."""
 
@@ -65,21 +63,17 @@ class SeriesPrior(NamedTuple):
     logarithm: bool = False
 
     @classmethod
-    def estimate(
-        cls, sequences: Iterable[np.ndarray], lag: int = 0, steps: int | None = None, logarithm: bool = False
-    ) -> SeriesPrior:
-        """Estimate the prior from training sequences, by moments (Smyth, 2004, section 6, for d and v).
+    def estimate(cls, sequences: Iterable[np.ndarray], lag: int = 0, logarithm: bool = False) -> SeriesPrior:
+        """Estimate the prior from training windows, by moments (Smyth, 2004, section 6, for d and v).
 
         Args:
             sequences: values (T,) of each sequence, NaN where missing.
             lag: L.
-            steps: length of the windows for which models have one level and scale; None for whole sequences.
             logarithm: whether f is the logarithm.
         """
         values = [np.log(x) if logarithm else np.asarray(x, np.float64) for x in sequences]
         level, spread = np.nanmean(np.concatenate(values)), np.nanstd(np.concatenate(values))
-        windows = [x[n : n + (steps or len(x))] for x in values for n in range(0, len(x), steps or max(len(x), 1))]
-        windows = [_relative(x, lag) for x in windows[:: -(-len(windows) // WINDOWS) or 1]]
+        windows = [_relative(x, lag) for x in values]
         several = [u for u in windows if len(u) > 2] or [np.concatenate([*windows, np.zeros(3)])]
         means, variances = np.array([u.mean() for u in several]), np.array([u.var(ddof=1) for u in several])
         degrees = np.array([len(u) - 1.0 for u in several])

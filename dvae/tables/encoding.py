@@ -27,9 +27,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from ..data.batch import Batch
-from ..data.blocks import ColumnSummary, blocks, row_blocks
+from ..data.blocks import NUMBERS, ColumnSummary, blocks, row_blocks
+from ..data.npy import is_mapped
 from ..data.schema import Schema, SchemaError
-from ..data.series_units import LOCATION, WINDOWS, SeriesPrior, SeriesUnits
+from ..data.series_units import LOCATION, SeriesPrior, SeriesUnits
 from ..data.units import LEVELS, RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, Coordinate, is_imprecise
 from ..data.views import ContextView, Dequantised, View, Views
 from ..distributions.base import DistributionSpec
@@ -57,9 +58,13 @@ TargetUnits = Literal["columns", "logs", "series", "changes", "seasonal"]
 
 "columns": mean and scale of each column. "logs": the same, for logarithms of positive data. "series": level and scale
 of each sequence. "changes": changes since the last value. "seasonal": differences from the mean of the same step in
-earlier seasons. Both are relative to their mean and scale in the sequence (`dvae.data.series_units`). The last three use
-logarithms of positive data, and the level of a sequence as a known factor of its counts.
+earlier seasons. Both are relative to their mean and scale in the sequence (`dvae.data.series_units`). The last three
+use logarithms of positive data, and the level of a sequence as a known factor of its counts.
 """
+UNITS_OF_SERIES = (*CENTRED, *POSITIVE, *COUNTS)
+"""Families whose targets can be relative to their sequence."""
+LONGEST = 1024
+"""Maximum number of steps of a training window for the choice of units if sequences are not cut."""
 FIXED = 1e12
 """Weight of a prior that observations do not change."""
 
@@ -178,8 +183,9 @@ class PanelSchema(Schema):
         median = float(np.median(gaps)) if len(gaps) else 0.0
         step = median if len(gaps) and (gaps.max() > EVEN * median or median > EVEN * gaps.min()) else 0.0
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
-        units["priors"] = _estimate_priors(panel.columns, training, cut)
-        units["preferred"] = _prefer(panel.columns, training, cut)
+        windows = _TrainingWindows(training, cut)
+        units["priors"] = _estimate_priors(panel.columns, windows)
+        units["preferred"] = _prefer(panel.columns, windows)
         return cls(
             columns=panel.columns,
             cut=cut,
@@ -451,57 +457,74 @@ class PanelSchema(Schema):
         return cls(**options)
 
 
-def _estimate_priors(
-    columns: Columns, training: Sequence[np.ndarray], cut: Cut
-) -> dict[str, dict[str, tuple[float, ...]]]:
-    """Return the priors of levels and scales by column and lag; "log" has mean and deviation of logarithms of counts.
+@dataclass(frozen=True)
+class _TrainingWindows:
+    """Evenly spaced windows of training sequences, as long as those of the cut; without a cut at most `LONGEST` steps.
+
+    A column has at most `NUMBERS` values in them, and an eighth of it if sequences are mapped from disk.
 
     Args:
-        columns: columns of the values.
         training: values (T, C) of training sequences.
-        cut: how sequences are cut into windows, and their season.
+        cut: how sequences are cut into windows.
     """
+
+    training: Sequence[np.ndarray]
+    cut: Cut
+
+    @cached_property
+    def places(self) -> list[tuple[int, slice]]:
+        """Sequence and steps of each window."""
+        steps, stride = self.cut.length or LONGEST, self.cut.horizon or LONGEST
+        ends = [len(part) - (self.cut.length or 1) + 1 for part in self.training]
+        places = [(n, slice(t, t + steps)) for n, end in enumerate(ends) for t in range(0, end, stride)]
+        most = NUMBERS // (8 if any(map(is_mapped, self.training)) else 1) // steps
+        return places[:: -(-len(places) // max(most, 1))]
+
+    def column(self, index: int) -> list[np.ndarray]:
+        """Return the values (T,) of a column in each window, in float64."""
+        return [self.training[n][part, index].astype(np.float64) for n, part in self.places]
+
+
+def _estimate_priors(columns: Columns, windows: _TrainingWindows) -> dict[str, dict[str, tuple[float, ...]]]:
+    """Return the priors of levels and scales by column and lag; "log" has mean and deviation of logarithms of counts."""
     priors: dict[str, dict[str, tuple[float, ...]]] = {}
+    cut = windows.cut
     for index, column in enumerate(columns.columns):
-        is_count = column.family in COUNTS
-        if column.role != "target" or column.family not in (*CENTRED, *POSITIVE, *COUNTS):
+        if column.role != "target" or column.family not in UNITS_OF_SERIES:
             continue
-        values = [part[:, index].astype(np.float64) for part in training]
+        values, is_count = windows.column(index), column.family in COUNTS
+        if np.isnan(np.concatenate(values)).all():
+            continue
         by_lag = priors.setdefault(column.name, {})
         for lag in {0} if is_count else {0, 1, cut.season or 0}:
             if cut.observed is None or lag <= cut.observed:
-                prior = SeriesPrior.estimate(values, lag, cut.length, column.family in POSITIVE)
-                by_lag[str(lag)] = tuple(map(float, prior))
+                by_lag[str(lag)] = tuple(map(float, SeriesPrior.estimate(values, lag, column.family in POSITIVE)))
         if is_count:
             logarithms = np.log(np.concatenate(values).clip(0.5))
             by_lag["log"] = float(np.nanmean(logarithms)), float(np.nanstd(logarithms)) or 1.0
     return priors
 
 
-def _prefer(columns: Columns, training: Sequence[np.ndarray], cut: Cut) -> str:
+def _prefer(columns: Columns, windows: _TrainingWindows) -> str:
     """Return `PanelSchema.preferred`, by mean absolute errors relative to the smallest one of each column."""
-    if cut.observed is None or cut.horizon is None or cut.length is None:
+    cut, totals = windows.cut, dict[str, float]()
+    if cut.observed is None or cut.horizon is None:
         return "columns"
-    starts = [(n, t) for n, part in enumerate(training) for t in range(0, len(part) - cut.length + 1, cut.horizon)]
-    starts = starts[:: -(-len(starts) // WINDOWS)]
-    windows = np.stack([training[n][t : t + cut.length] for n, t in starts]).astype(np.float64)
-    totals: dict[str, float] = {}
     for index, column in enumerate(columns.columns):
-        if column.role != "target" or column.family not in (*CENTRED, *POSITIVE, *COUNTS):
+        if column.role != "target" or column.family not in UNITS_OF_SERIES:
             continue
-        x = np.log(windows[..., index]) if column.family in POSITIVE else windows[..., index]
+        x = np.stack(windows.column(index))
+        x = np.log(x) if column.family in POSITIVE else x
         past, future = np.ma.masked_invalid(x[:, : cut.observed]), np.ma.masked_invalid(x[:, cut.observed :])
         present = np.maximum.accumulate(np.where(past.mask, -1, np.arange(cut.observed)), 1)[:, -1:]
         last = np.ma.array(np.take_along_axis(x, present.clip(0), 1), mask=present < 0)
         points = {"columns": past.mean(), "series": past.mean(1, keepdims=True), "changes": last}
         if cut.season:
-            phase = (np.arange(cut.observed), cut.observed + np.arange(cut.horizon))
-            means = [past[:, phase[0] % cut.season == p].mean(1) for p in range(cut.season)]
-            points["seasonal"] = np.ma.stack(means, 1)[:, phase[1] % cut.season]
+            means = [past[:, phase :: cut.season].mean(1) for phase in range(cut.season)]
+            points["seasonal"] = np.ma.stack(means, 1)[:, (cut.observed + np.arange(cut.horizon)) % cut.season]
         errors = {name: float(np.ma.filled(abs(future - point).mean(), np.inf)) for name, point in points.items()}
-        least = min(errors.values()) or 1.0
         for name, error in errors.items():
-            totals[name] = totals.get(name, 0.0) + error / least
+            totals[name] = totals.get(name, 0.0) + error / (min(errors.values()) or 1.0)
     return min(totals, key=lambda name: totals[name], default="columns")
 
 

@@ -307,7 +307,7 @@ def test_options_for_another_kind_of_data_are_errors(people, table_runs, tmp_pat
         error = failure(capsys, "fit", name, *options)
         assert "needs the description of poses, but was given panel, which has none; take a method for any" in error
     error = failure(capsys, "fit", "srnn", *options, "--residual", "1")
-    assert 'leave residual at 0, or give all columns one distribution with emission="normal"' in error
+    assert "has no location to which the previous value can be added; leave residual at 0" in error
     assert not (tmp_path / "run" / "config.json").exists()
 
 

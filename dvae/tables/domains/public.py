@@ -89,7 +89,7 @@ def ridership() -> Panel:
     date. Here all refer to the same day, so that the first 14 days of riders and the last 14 days of the rest are left
     out. Riders are in thousands; 242 values are zero, mostly of closed stations. Federal holidays of the
     United States (on the days of their observance) and home games are known in advance; temperature, precipitation and
-    wind are known up to the present. Away games and other columns on the weather are left out. Origin: Kuhn and Johnson
+    wind are known up to the present. The place, a static covariate, is the station. Away games and other columns on the weather are left out. Origin: Kuhn and Johnson
     (2020), Feature Engineering and Selection.
 
     Raises:
@@ -108,11 +108,12 @@ def ridership() -> Panel:
         ["date", *games, *(column.name for column in weather)], stations, "station", "riders"
     )
     holidays = USFederalHolidayCalendar().holidays(frame["date"].min(), frame["date"].max())
-    frame = frame.assign(holiday=frame["date"].isin(holidays))
+    frame = frame.assign(holiday=frame["date"].isin(holidays), place=frame["station"])
     columns = (
         Column("riders", unit="thousands"),
         *(Column(name, "known") for name in ("holiday", *games)),
         *weather,
+        Column("place", "static", "category", classes=tuple(sorted(stations))),
     )
     schema = Columns(columns, ("station",), "date", calendar=("weekday", "day_of_year"))
     return Panel.of(frame, schema, "ridership")
@@ -186,7 +187,7 @@ def storms() -> Panel:
     first = ~(frame.groupby("name")["time"].diff() < pd.Timedelta(days=30))  # names recur, some in the next January
     frame["storm"] = frame["name"] + " " + frame["year"].where(first).ffill().astype(int).astype(str)
     columns = (
-        Column("wind", family="log-normal", unit="knots"),
+        Column("wind", family="log-normal", unit="knots", rounding=5.0),
         *_columns("past", pressure="mbar", lat="°", long="°"),
     )
     return Panel.of(regular(frame, "storm", "time", "6h"), Columns(columns, ("storm",), "time"), "storms")

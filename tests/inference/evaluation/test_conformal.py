@@ -309,8 +309,8 @@ def test_successive_windows_calibrate_as_one(panel):
     early = [n for n, (_, _, start) in enumerate(windows.keys) if start < 100]
     late = [n for n in range(len(windows)) if n not in early]
     parts = [windows.subset(early), windows.subset(late)]
-    options = {"residuals": train, "progress": False}
-    whole, pooled = (conformal_bands("last value", each, **options) for each in (windows, parts))
+    options = {"residuals": train, "training_windows": train, "progress": False}
+    whole, pooled = (conformal_bands("mean", each, **options) for each in (windows, parts))
     for region, factor in whole.factors.items():
         np.testing.assert_allclose(pooled.factors[region], factor)
     with pytest.raises(ValueError, match="expected one model for each of 2 windows, got 1"):
