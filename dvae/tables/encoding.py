@@ -27,7 +27,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from ..data.batch import Batch
-from ..data.blocks import NUMBERS, ColumnSummary, blocks, row_blocks
+from ..data.blocks import NUMBERS as BLOCK
+from ..data.blocks import ColumnSummary, blocks, row_blocks
 from ..data.npy import is_mapped
 from ..data.schema import Schema, SchemaError
 from ..data.series_units import LOCATION, SeriesPrior, SeriesUnits
@@ -461,7 +462,7 @@ class PanelSchema(Schema):
 class _TrainingWindows:
     """Evenly spaced windows of training sequences, as long as those of the cut; without a cut at most `LONGEST` steps.
 
-    A column has at most `NUMBERS` values in them, and an eighth of it if sequences are mapped from disk.
+    A column has at most `BLOCK` values in them, and an eighth of it if sequences are mapped from disk.
 
     Args:
         training: values (T, C) of training sequences.
@@ -477,7 +478,7 @@ class _TrainingWindows:
         steps, stride = self.cut.length or LONGEST, self.cut.horizon or LONGEST
         ends = [len(part) - (self.cut.length or 1) + 1 for part in self.training]
         places = [(n, slice(t, t + steps)) for n, end in enumerate(ends) for t in range(0, end, stride)]
-        most = NUMBERS // (8 if any(map(is_mapped, self.training)) else 1) // steps
+        most = BLOCK // (8 if any(map(is_mapped, self.training)) else 1) // steps
         return places[:: -(-len(places) // max(most, 1))]
 
     def column(self, index: int) -> list[np.ndarray]:
@@ -486,7 +487,7 @@ class _TrainingWindows:
 
 
 def _estimate_priors(columns: Columns, windows: _TrainingWindows) -> dict[str, dict[str, tuple[float, ...]]]:
-    """Return the priors of levels and scales by column and lag; "log" has mean and deviation of logarithms of counts."""
+    """Return priors of level and scale by column and lag; "log" has mean and deviation of the logarithms of counts."""
     priors: dict[str, dict[str, tuple[float, ...]]] = {}
     cut = windows.cut
     for index, column in enumerate(columns.columns):

