@@ -23,7 +23,7 @@ of earlier seasons plus what the model adds.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -63,42 +63,30 @@ class SeriesPrior(NamedTuple):
     logarithm: bool = False
 
     @classmethod
-    def estimate(cls, sequences: Iterable[np.ndarray], lag: int = 0, logarithm: bool = False) -> SeriesPrior:
+    def estimate(cls, windows: np.ndarray, lag: int = 0, logarithm: bool = False) -> SeriesPrior:
         """Estimate the prior from training windows, by moments (Smyth, 2004, section 6, for d and v).
 
         Args:
-            sequences: values (T,) of each sequence, NaN where missing.
+            windows: values (N, T), NaN where missing; at least one is observed.
             lag: L.
             logarithm: whether f is the logarithm.
         """
-        values = [np.log(x) if logarithm else np.asarray(x, np.float64) for x in sequences]
-        level, spread = np.nanmean(np.concatenate(values)), np.nanstd(np.concatenate(values))
-        windows = [_relative(x, lag) for x in values]
-        several = [u for u in windows if len(u) > 2] or [np.concatenate([*windows, np.zeros(3)])]
-        means, variances = np.array([u.mean() for u in several]), np.array([u.var(ddof=1) for u in several])
-        degrees = np.array([len(u) - 1.0 for u in several])
-        within = max(float((degrees * variances).sum() / degrees.sum()), 1e-12 * float(spread) ** 2, 1e-36)
-        between = float(means.var() - (within / (degrees + 1)).mean())
+        z = torch.from_numpy(np.log(windows) if logarithm else np.asarray(windows, np.float64))[..., None]
+        level, spread = float(np.nanmean(z)), float(np.nanstd(z))
+        base, count, present = torch.zeros_like(z), torch.ones_like(z), ~z.isnan()
+        if lag:
+            base, count, _ = _last_values(z, present) if lag == 1 else _means_by_phase(z, present, lag)
+        u = torch.where(present & (count > 0), z - base, torch.nan)[..., 0].numpy()
+        numbers = (~np.isnan(u)).sum(1)
+        u, numbers = u[numbers > 2], numbers[numbers > 2]
+        if not len(u):
+            return cls(0.0, 1.0, spread**2 or 1.0, 1.0, level, spread or 1.0, logarithm)
+        means, variances, degrees = np.nanmean(u, 1), np.nanvar(u, 1, ddof=1), numbers - 1.0
+        within = max(float((degrees * variances).sum() / degrees.sum()), 1e-12 * spread**2, 1e-36)
+        between = float(means.var() - (within / numbers).mean())
         freedom, variance = _inverse_chi_square(variances, degrees, within)
-        return cls(
-            mean=float(means.mean()),
-            weight=float(np.clip(within / max(between, 1e-9 * within), 1e-6, 100.0)),
-            variance=variance,
-            freedom=freedom,
-            level=float(level),
-            spread=float(spread) or 1.0,
-            logarithm=logarithm,
-        )
-
-
-def _relative(x: np.ndarray, lag: int) -> np.ndarray:
-    """Return u_t for the steps of f(x) (T,) that have a base, without missing values."""
-    z = torch.from_numpy(x)[None, :, None]
-    base, count, present = torch.zeros_like(z), torch.ones_like(z), ~z.isnan()
-    if lag:
-        base, count, _ = _last_values(z, present) if lag == 1 else _means_by_phase(z, present, lag)
-    u: np.ndarray = (z - base)[present & (count > 0)].numpy()
-    return u
+        weight = float(np.clip(within / max(between, 1e-9 * within), 1e-6, 100.0))
+        return cls(float(means.mean()), weight, variance, freedom, level, spread or 1.0, logarithm)
 
 
 def _inverse_chi_square(variances: np.ndarray, degrees: np.ndarray, within: float) -> tuple[float, float]:

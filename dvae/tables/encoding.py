@@ -481,9 +481,13 @@ class _TrainingWindows:
         most = BLOCK // (8 if any(map(is_mapped, self.training)) else 1) // steps
         return places[:: -(-len(places) // max(most, 1))]
 
-    def column(self, index: int) -> list[np.ndarray]:
-        """Return the values (T,) of a column in each window, in float64."""
-        return [self.training[n][part, index].astype(np.float64) for n, part in self.places]
+    def column(self, index: int) -> np.ndarray:
+        """Return the values (N, T) of a column in each window, in float64; shorter windows end with NaN."""
+        longest = max(len(self.training[n][part]) for n, part in self.places)
+        values = np.full((len(self.places), longest), np.nan)
+        for row, (n, part) in zip(values, self.places, strict=True):
+            row[: len(self.training[n][part])] = self.training[n][part, index]
+        return values
 
 
 def _estimate_priors(columns: Columns, windows: _TrainingWindows) -> dict[str, dict[str, tuple[float, ...]]]:
@@ -494,14 +498,14 @@ def _estimate_priors(columns: Columns, windows: _TrainingWindows) -> dict[str, d
         if column.role != "target" or column.family not in UNITS_OF_SERIES:
             continue
         values, is_count = windows.column(index), column.family in COUNTS
-        if np.isnan(np.concatenate(values)).all():
+        if np.isnan(values).all():
             continue
         by_lag = priors.setdefault(column.name, {})
         for lag in {0} if is_count else {0, 1, cut.season or 0}:
             if cut.observed is None or lag <= cut.observed:
                 by_lag[str(lag)] = tuple(map(float, SeriesPrior.estimate(values, lag, column.family in POSITIVE)))
         if is_count:
-            logarithms = np.log(np.concatenate(values).clip(0.5))
+            logarithms = np.log(values.clip(0.5))
             by_lag["log"] = float(np.nanmean(logarithms)), float(np.nanstd(logarithms)) or 1.0
     return priors
 
@@ -514,7 +518,7 @@ def _prefer(columns: Columns, windows: _TrainingWindows) -> str:
     for index, column in enumerate(columns.columns):
         if column.role != "target" or column.family not in UNITS_OF_SERIES:
             continue
-        x = np.stack(windows.column(index))
+        x = windows.column(index)
         x = np.log(x) if column.family in POSITIVE else x
         past, future = np.ma.masked_invalid(x[:, : cut.observed]), np.ma.masked_invalid(x[:, cut.observed :])
         present = np.maximum.accumulate(np.where(past.mask, -1, np.arange(cut.observed)), 1)[:, -1:]

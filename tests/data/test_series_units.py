@@ -116,7 +116,7 @@ def test_the_prior_is_recovered_from_simulated_sequences(lag):
         for t in range(lag, len(u)) if lag else ():
             x[t] = x[t - lag] + u[t]
         sequences.append(x)
-    prior = SeriesPrior.estimate(sequences, lag)
+    prior = SeriesPrior.estimate(np.array(sequences), lag)
     assert prior.mean == pytest.approx(mean, abs=4 * math.sqrt(variance / weight / 1500))
     assert prior.freedom == pytest.approx(freedom, rel=0.2)
     assert prior.variance == pytest.approx(variance, rel=0.1)
@@ -126,9 +126,11 @@ def test_the_prior_is_recovered_from_simulated_sequences(lag):
 
 def test_equal_variances_give_the_largest_weight_and_constant_sequences_a_finite_prior():
     random = np.random.default_rng(2)
-    assert SeriesPrior.estimate(list(random.normal(0, 3, (200, 30)))).freedom == 100
-    for sequences in ([np.zeros(9)] * 3, [np.arange(2.0)], [np.full(5, np.nan), np.arange(9.0)]):
-        assert np.isfinite(SeriesPrior.estimate(sequences)).all()
+    assert SeriesPrior.estimate(random.normal(0, 3, (200, 30))).freedom == 100
+    half = np.where(np.arange(9) % 2, np.nan, np.arange(9.0))
+    for windows in (np.zeros((3, 9)), np.arange(2.0)[None], np.stack([np.arange(9.0), half, half])):
+        for lag in (0, 1, 4):
+            assert np.isfinite(SeriesPrior.estimate(windows, lag)).all()
 
 
 def white_noise(view):

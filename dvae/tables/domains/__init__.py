@@ -81,7 +81,7 @@ DOMAINS: dict[str, Domain] = {
     "ridership": Domain(
         "dvae.tables.domains.public:ridership",
         "Daily riders of 20 stations of the Chicago L, 2001 to 2016.",
-        Cut(56, 14, split="time", season=7),
+        Cut(56, 14, stride=42, split="time", season=7),
     ),
     "weather": Domain(
         "dvae.tables.domains.public:weather",
