@@ -11,14 +11,16 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 import tyro
 
 import dvae
-from dvae.inference.evaluation.scores import CRPS, Measure, coverage_at
+from dvae.inference.evaluation.estimates import decimals
+from dvae.inference.evaluation.scores import Measure, calibrated
 from dvae.tables.dataset import PanelData
 
-from .engine import OURS, Row, cell, fit_or_load, measure, read, scores_of, settings
+from .engine import OURS, Row, fit_or_load, measure, read, scores_of, settings
 from .results import Table, ordered, tabled, write
 
 FORECASTS = 100
@@ -26,7 +28,7 @@ REFERENCES = "autoregressive"
 """Case whose first seed also scores the simple forecasts."""
 DVAES = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "dsae", "kvae", "equations")
 """Methods with latents."""
-LEVEL, COVERAGE = 0.9, "coverage 90 %"
+COVERAGE = "coverage 90 %"
 SECTIONS = settings(__file__)
 
 
@@ -37,8 +39,8 @@ def load(name: str) -> PanelData:
 
 
 def scores(windows: Any) -> list[Measure]:
-    """Return the scores of the tables, divided by the scale of each column in the training data."""
-    return [CRPS, coverage_at(LEVEL)]
+    """Return the scores of the tables; with several columns, each is divided by its scale in the training data."""
+    return [each for each in calibrated(windows) if each.name in ("CRPS", COVERAGE)]
 
 
 def run(name: str, part: str, case: str, seed: int, out: Path) -> dict[str, Any]:
@@ -70,6 +72,16 @@ def rows_of(cases: Mapping[str, Row]) -> tuple[dict[str, Row], dict[str, Row]]:
     return ordered(cases, crps), ordered(simple, crps)
 
 
+def cell(row: Row, score: str = "CRPS", other: Row | None = None) -> str:
+    """Return a score, or its paired difference from another row, with the error over sequences and seeds."""
+    estimate = row.estimate(score, other)
+    if estimate is None:
+        return "–"
+    error = estimate.sequences if np.isnan(estimate.total) else estimate.total
+    places = decimals(estimate.mean, error)
+    return f"{estimate.mean:.{places}f} ± {error:.{places}f}"
+
+
 def crps(row: Row) -> float:
     """Return the mean CRPS of a row."""
     estimate = row.estimate("CRPS")
@@ -82,9 +94,9 @@ def detail(cases: Mapping[str, Row], note: str) -> Table:
     methods, simple = rows_of(cases)
     best = next(iter(simple), None)
     columns = {
-        "CRPS": lambda row: cell(row.estimate("CRPS")),
-        f"minus {best}": lambda row: "–" if row is simple[best] else cell(row.estimate("CRPS", simple[best])),
-        COVERAGE: lambda row: cell(row.estimate(COVERAGE)),
+        "CRPS": cell,
+        f"minus {best}": lambda row: "–" if row is simple[best] else cell(row, "CRPS", simple[best]),
+        COVERAGE: lambda row: cell(row, COVERAGE),
     }
     return tabled(ordered({**methods, **simple}, crps), columns if best else {"CRPS": columns["CRPS"]}, note=note)
 
@@ -96,9 +108,8 @@ def summary(available: Mapping[str, Mapping[str, Row]]) -> Table:
         _, simple = rows_of(cases)
         best, chosen = next(iter(simple)), SECTIONS[name]["chosen"]
         row = cases[chosen]
-        difference = cell(row.estimate("CRPS", simple[best]))
-        values = cell(simple[best].estimate("CRPS")), cell(row.estimate("CRPS"))
-        lines.append([name, f"{best}: {values[0]}", f"{chosen}: {values[1]}", difference, cell(row.estimate(COVERAGE))])
+        difference = cell(row, "CRPS", simple[best])
+        lines.append([name, f"{best}: {cell(simple[best])}", f"{chosen}: {cell(row)}", difference, cell(row, COVERAGE)])
     return Table(["", "best simple forecast, CRPS", "DVAE, CRPS", "difference", COVERAGE], lines)
 
 

@@ -38,6 +38,8 @@ CLASSES = 20
 """Maximum number of distinct texts of a category; columns with more are ids or free text."""
 SPREAD = 1.5
 """Ratio of variance to mean above which counts are overdispersed."""
+LARGE_COUNT = 1000
+"""Smallest value of whole numbers that are like continuous data: a step of 1 is at most a thousandth of each value."""
 LARGEST = 1e30
 """Bound on absolute values, since models compute in float32."""
 TIMES = re.compile(
@@ -517,6 +519,8 @@ class _Inference:
         if not (np.abs(numbers) < LARGEST).all():
             return Column(name)  # reading raises an error
         is_count = (numbers >= 0).all() and (numbers % 1 == 0).all() and len(np.unique(numbers)) > 2
+        if is_count and numbers.min() >= LARGE_COUNT and numbers.std() > 0.5 * numbers.mean():
+            return Column(name, family="log-normal")
         if is_count and numbers.std() > RESOLVED * numbers.mean():
             return Column(name, family="overdispersed" if numbers.var() > SPREAD * numbers.mean() else "count")
         if (numbers.astype(np.float32) > 0).all() and numbers.std() > 0.5 * numbers.mean():
