@@ -102,15 +102,21 @@ def detail(cases: Mapping[str, Row], note: str) -> Table:
 
 
 def summary(available: Mapping[str, Mapping[str, Row]]) -> Table:
-    """Return a line for each table: best simple forecast, the DVAE that validation chose, and their difference."""
+    """Return a line for each table: the best simple forecast, and skill and coverage of the DVAE that was chosen.
+
+    Skill is 1 - CRPS / CRPS of the best simple forecast; its error is from the paired difference.
+    """
     lines = []
     for name, cases in available.items():
         _, simple = rows_of(cases)
         best, chosen = next(iter(simple)), SECTIONS[name]["chosen"]
         row = cases[chosen]
-        difference = cell(row, "CRPS", simple[best])
-        lines.append([name, f"{best}: {cell(simple[best])}", f"{chosen}: {cell(row)}", difference, cell(row, COVERAGE)])
-    return Table(["", "best simple forecast, CRPS", "DVAE, CRPS", "difference", COVERAGE], lines)
+        least, difference = crps(simple[best]), row.estimate("CRPS", simple[best])
+        assert difference is not None
+        error = difference.sequences if np.isnan(difference.total) else difference.total
+        skill = f"{-difference.mean / least:.3f} ± {error / least:.3f}"
+        lines.append([name, best, chosen, skill, cell(row, COVERAGE)])
+    return Table(["", "best simple forecast", "DVAE", "skill ↑", COVERAGE], lines)
 
 
 def tables(runs: Path, part: str) -> dict[str, Table]:

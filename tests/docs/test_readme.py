@@ -34,16 +34,18 @@ def test_the_commands_for_a_table_run(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     rows = [
-        f"shop{shop},2024-{month:02}-01,{rng.poisson(20)},{rng.normal(15, 5):.1f}\n"
-        for shop in range(30)
-        for month in range(1, 13)
+        f"country{place},{'ab'[place % 2]},{year},{rng.normal(60, 5):.1f},"
+        f"{rng.integers(10**5, 10**7)},{rng.gamma(2):.2f}\n"
+        for place in range(30)
+        for year in range(1952, 2012, 5)
     ]
-    (tmp_path / "sales.csv").write_text("".join(["shop,month,sold,temperature\n", *rows]), encoding="utf-8")
+    header = "country,continent,year,lifeExp,pop,gdpPercap\n"
+    (tmp_path / "countries.csv").write_text("".join([header, *rows]), encoding="utf-8")
     (section,) = re.findall(r"## A CSV in four commands\n(.*?)\n## ", README, re.DOTALL)
     commands = [shlex.split(line, comments=True) for line in re.findall(r"^dvae (.*)", section, re.MULTILINE)]
     assert [name for name, *_ in commands] == ["data", "fit", "evaluate", "forecast"]
     for arguments in commands:
         assert main([*arguments, *shlex.split(SMALL.get(arguments[0], ""))]) == 0, capsys.readouterr().err
     assert "climatology" in capsys.readouterr().out
-    assert (tmp_path / "next.csv").read_text(encoding="utf-8").count("shop29") > 1
+    assert (tmp_path / "next.csv").read_text(encoding="utf-8").count("country29") > 1
     assert (tmp_path / "next.png").read_bytes().startswith(b"\x89PNG")

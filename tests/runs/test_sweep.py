@@ -74,7 +74,7 @@ def test_a_run_of_a_sweep_equals_a_separate_fit_bit_for_bit(swept, data, tmp_pat
     assert [result.method for result in results] == methods * 2
     assert len({result.best_bound for result in results}) == 4
     assert {path.name for path in out.iterdir()} == {result.path.name for result in results}  # no lease remains
-    assert dvae.load(results[0].path).method == VAE
+    assert dvae.load(results[0].path).method == replace(VAE, units="columns")
 
 
 def test_finished_runs_are_not_repeated(swept, data, capsys):
