@@ -6,7 +6,7 @@ skips existing files. Options are chosen with `--part validation`, seed 0; `--pa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
@@ -92,13 +92,11 @@ def crps(row: Row) -> float:
 def detail(cases: Mapping[str, Row], note: str) -> Table:
     """Return a table of all rows, best first, with paired differences from the best simple forecast."""
     methods, simple = rows_of(cases)
-    best = next(iter(simple), None)
-    columns = {
-        "CRPS": cell,
-        f"minus {best}": lambda row: "–" if row is simple[best] else cell(row, "CRPS", simple[best]),
-        COVERAGE: lambda row: cell(row, COVERAGE),
-    }
-    return tabled(ordered({**methods, **simple}, crps), columns if best else {"CRPS": columns["CRPS"]}, note=note)
+    columns: dict[str, Callable[[Row], str]] = {"CRPS": cell, COVERAGE: lambda row: cell(row, COVERAGE)}
+    for best in [*simple][:1]:
+        least = simple[best]
+        columns[f"minus {best}"] = lambda row: "–" if row is least else cell(row, "CRPS", least)
+    return tabled(ordered({**methods, **simple}, crps), columns, note=note)
 
 
 def summary(available: Mapping[str, Mapping[str, Row]]) -> Table:

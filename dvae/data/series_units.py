@@ -29,8 +29,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.optimize import brentq
-from scipy.special import digamma, polygamma
 from torch import Tensor
 from typing_extensions import override
 
@@ -94,6 +92,9 @@ def _inverse_chi_square(variances: np.ndarray, degrees: np.ndarray, within: floa
 
     The logarithm of an estimated variance has the variance psi'(degrees / 2) + psi'(d / 2) and a known mean.
     """
+    from scipy.optimize import brentq  # slow to import
+    from scipy.special import digamma, polygamma
+
     positive = variances > 1e-9 * within  # windows without variation have no logarithm
     if positive.sum() < 2:
         return 1.0, within

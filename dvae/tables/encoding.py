@@ -206,7 +206,7 @@ class PanelSchema(Schema):
         """Names of the coordinates of x."""
         return [name for column in self.columns.targets for name in column.coordinates]
 
-    def in_units(self, target_units: str) -> Self:
+    def in_units(self, target_units: TargetUnits) -> Self:
         """Return the schema with other units of the targets; see `TargetUnits`.
 
         Raises:
@@ -238,7 +238,7 @@ class PanelSchema(Schema):
         values = self.priors.get(column.name, {}).get(lag)
         if values is None or (self.target_units == "logs" and column.family not in POSITIVE):
             return None
-        prior = SeriesPrior(*values[:-1], bool(values[-1]))
+        prior = SeriesPrior._make((*values[:-1], bool(values[-1])))
         if self.target_units == "logs":
             return prior._replace(mean=prior.level, weight=FIXED, variance=prior.spread**2, freedom=FIXED)
         return prior
@@ -250,7 +250,7 @@ class PanelSchema(Schema):
             batch: windows with x (B, T, D), their mask and lengths.
         """
         columns = [column for column in self.columns.targets for _ in column.coordinates]
-        priors = [SeriesPrior(*self.priors[columns[n].name]["0"][:-1]) for n in self.counts]
+        priors = [SeriesPrior._make((*self.priors[columns[n].name]["0"][:-1], False)) for n in self.counts]
         view = SeriesUnits(tuple(priors), observed=self.cut.observed)
         parts = {"x": batch["x"][..., self.counts]}
         if (mask := batch.mask()) is not None:
