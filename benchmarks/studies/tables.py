@@ -93,8 +93,8 @@ def detail(cases: Mapping[str, Row], note: str) -> Table:
     """Return a table of all rows, best first, with paired differences from the best simple forecast."""
     methods, simple = rows_of(cases)
     columns: dict[str, Callable[[Row], str]] = {"CRPS": cell, COVERAGE: lambda row: cell(row, COVERAGE)}
-    for best in [*simple][:1]:
-        least = simple[best]
+    if simple:
+        best, least = next(iter(simple.items()))
         columns[f"minus {best}"] = lambda row: "–" if row is least else cell(row, "CRPS", least)
     return tabled(ordered({**methods, **simple}, crps), columns, note=note)
 
