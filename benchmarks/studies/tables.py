@@ -124,7 +124,7 @@ def tables(runs: Path, part: str) -> dict[str, Table]:
         cases = read(runs / name, section["cases"], f"{part}.json")
         if not cases:
             continue
-        first = next(iter(cases.values())).runs
+        first = max((row.runs for row in cases.values()), key=len)
         minutes = sum(one["seconds"] for row in cases.values() for one in row.runs) / 60
         note = f"{part.capitalize()}: {sum(first[0]['weights'])} windows of {len(first[0]['clips'])} sequences; "
         note += f"{len(first)} seeds; all fits took {minutes:.0f} minutes of processor time."

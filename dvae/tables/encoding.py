@@ -121,6 +121,14 @@ class PanelSchema(Schema):
         for name, value in (("sizes", sizes), ("length", self.cut.length), ("observed", self.cut.observed)):
             object.__setattr__(self, name, value)  # derived from the other fields
         super().__post_init__()
+        for name, by_lag in self.priors.items():
+            for lag, values in by_lag.items():
+                positive = values[1:2] if lag == "log" else (*values[1:4], *values[5:6])
+                if len(values) != (2 if lag == "log" else 7) or not (np.isfinite(values).all() and min(positive) > 0):
+                    raise ValueError(
+                        f"the prior {lag} of {name} is {values}; expected finite numbers with positive scales, as "
+                        "`PanelSchema.from_data` estimates them"
+                    )
         covariates = self.columns.of("known", "past", "static")
         if missing := {c.name for c in covariates if c.family == "real"} - (self.means.keys() & self.scales.keys()):
             raise ValueError(

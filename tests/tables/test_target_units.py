@@ -72,6 +72,11 @@ def test_priors_come_from_training_sequences_and_survive_the_configuration(data)
         scaled = schema.in_units(units)
         assert PanelSchema.from_config(json.loads(json.dumps(scaled.config()))) == scaled
     assert "target_units" not in schema.config()
+    for values in ([0.0] * 7, [1.0] * 6, [1.0, 1.0, 1.0, 1.0, float("nan"), 1.0, 0.0]):
+        config = json.loads(json.dumps(schema.config()))
+        config["priors"]["price"]["0"] = values
+        with pytest.raises(ValueError, match="prior"):
+            PanelSchema.from_config(config)
     old = {name: value for name, value in schema.config().items() if name != "priors"}
     with pytest.raises(SchemaError, match="units='series' needs a column of numbers or counts"):
         PanelSchema.from_config(old).in_units("series")
