@@ -352,7 +352,10 @@ def _report(result: Fit) -> None:
     summary = ", ".join(filter(None, [f"{result.status} at step {result.step}", duration, result.best]))
     OUT.print(summary, highlight=False, soft_wrap=True)
     assert result.run is not None
-    OUT.print(_use(Run(result.run).config["method"]["method"], result.run), highlight=False, soft_wrap=True)
+    method = Run(result.run).config["method"]
+    if method.get("units") not in (None, "columns"):
+        OUT.print(f"targets are in the units {method['units']!r} (--units)", highlight=False)
+    OUT.print(_use(method["method"], result.run), highlight=False, soft_wrap=True)
 
 
 def _use(name: str, run: Path) -> str:

@@ -41,6 +41,10 @@ class Backtest(Evaluation):
             steps to the end.
         windows: number of windows (cutoffs, C) of each cluster.
         by_cutoff: `{method: {score: (cutoffs, C)}}`, as `Row.cluster_means`, NaN for a cluster without windows.
+
+    Example:
+        >>> dvae.Backtest.__mro__[1].__name__  # results of dvae.backtest are evaluations
+        'Evaluation'
     """
 
     cutoffs: list[str] = field(default_factory=list)
@@ -144,8 +148,12 @@ def backtest(
         SweepInterrupted: after Ctrl-C or SIGTERM.
 
     Example:
-        result = dvae.backtest([dvae.method("srnn")], data, cutoffs=4, step=28, training={"steps": 2000})
-        print(result, result.at(result.cutoffs[-1]))
+        >>> walks = torch.randn(6, 40, 1).cumsum(1).numpy()
+        >>> data = dvae.tables.PanelData.of(walks, cut=dvae.tables.Cut(observed=6, horizon=3, split="time"))
+        >>> method = dvae.method("autoregressive", width=4)
+        >>> result = dvae.backtest([method], data, cutoffs=2, training={"steps": 2}, samples=5, progress=False)
+        >>> result.cutoffs
+        ['6 steps to the end', '3 steps to the end']
     """
     step = data.protocol.horizon or 1 if step is None else step
     require(Count, cutoffs=cutoffs, step=step)

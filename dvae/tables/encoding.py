@@ -224,10 +224,10 @@ class PanelSchema(Schema):
         schema = replace(self, target_units=target_units)
         if target_units != "columns" and not any(schema._prior(column) for column in self.columns.targets):
             names = ", ".join(f"{column.name} ({column.family})" for column in self.columns.targets)
-            raise SchemaError(
-                f"units={target_units!r} needs a column of numbers or counts whose training windows have at least 3 "
-                f"values{', and a season of the cut' if target_units == 'seasonal' else ''}; got {names}"
-            )
+            needs = {"logs": "a column of a positive family", "seasonal": "a season (season=7, --season 7)"}
+            need = needs.get(target_units, "a column of numbers or counts")
+            advice = "take the units series or changes" if target_units in needs else "take the units columns"
+            raise SchemaError(f"units {target_units!r} need {need}; got {names}; {advice}")
         return schema
 
     @property

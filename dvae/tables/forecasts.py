@@ -142,8 +142,12 @@ class PanelForecasts:
                 if samples_needed(level) > len(draws):
                     continue
                 low, high = _quantile(draws, [(1 - level) / 2, (1 + level) / 2])
-                axis.fill_between(future_steps, low, high, color="C0", alpha=opacity, linewidth=0, label=f"{level:.0%}")
-            axis.plot(future_steps, np.median(draws, 0), "C0", label="median")
+                style: dict[str, Any] = {"color": "C0", "alpha": opacity, "label": f"{level:.0%}"}
+                if horizon == 1:  # a band over one step has no area
+                    axis.vlines(future_steps, low, high, linewidth=6, **style)
+                else:
+                    axis.fill_between(future_steps, low, high, linewidth=0, **style)
+            axis.plot(future_steps, np.median(draws, 0), "C0", marker="_" if horizon == 1 else None, label="median")
         axis.plot(past_steps, self.past[window, :, index], color="0.3", linewidth=1, marker=".", markersize=3)
         axis.plot(future_steps, self.truth[window, :, index], "k.", markersize=4, label="truth")
         if is_dated:
@@ -152,7 +156,7 @@ class PanelForecasts:
             axis.xaxis.set_major_locator(locator := AutoDateLocator(tz=steps.tz, maxticks=6))
             axis.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=steps.tz))
         else:
-            axis.set_xlabel("seconds" if self.times is not None else "step")
+            axis.set_xlabel("time" if self.times is not None else "step")
 
 
 @dataclass(frozen=True, eq=False)

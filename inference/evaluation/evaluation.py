@@ -201,13 +201,12 @@ class Evaluation(Result):
         if best is None or score is None:
             return []
         for name in [name for name, row in self.rows.items() if row.equations and score in row.cluster_means]:
-            difference, values = self.difference(name, best, score), f"{score} {self[name][score]}"
-            values = f"{values} against {self[best][score]}"
-            if difference.mean > 2 * difference.standard_error:
+            skill, values = self.skill(name), f"{score} {self[name][score]} against {self[best][score]}"
+            if skill.mean < -2 * skill.standard_error:
                 sentences.append(f"{name} is worse than {best} ({values})")
-            elif not difference.mean < -2 * difference.standard_error:  # or the error is unknown
+            elif not skill.mean > 2 * skill.standard_error:  # or the error is unknown
                 reason = "its error is unknown" if len(self.clusters) == 1 else "within two standard errors"
-                sentences.append(f"{name} is not better than {best} ({values}; difference {difference}, {reason})")
+                sentences.append(f"{name} is not shown to be better than {best} ({values}; skill {skill}, {reason})")
         return sentences
 
     def _both(self, first: str, second: str, metric: str) -> list[np.ndarray]:

@@ -70,7 +70,7 @@ def test_models_without_skill_are_named_in_a_sentence():
         poor
         == f"poor model is worse than drift (CRPS {result['poor model']['CRPS']} against {result['drift']['CRPS']})"
     )
-    assert equal.startswith("equal model is not better than drift (CRPS 1.975 ± ")
+    assert equal.startswith("equal model is not shown to be better than drift (CRPS 1.975 ± ")
     assert equal.endswith("within two standard errors)")
     for printed in (str(result), str(Evaluation.from_json(result.to_json()))):
         text = " ".join(printed.split())
@@ -81,7 +81,7 @@ def test_models_without_skill_are_named_in_a_sentence():
 
 def test_a_single_cluster_leaves_the_difference_uncertain():
     (sentence,) = evaluation(clusters=1, drift=[1], model=[2]).verdicts
-    assert sentence.startswith("model is not better than drift")
+    assert sentence.startswith("model is not shown to be better than drift")
     assert "its error is unknown" in sentence
 
 

@@ -1,0 +1,1 @@
+"""Tests; a package, because some packages of third parties install one of this name."""
