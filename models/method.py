@@ -87,8 +87,8 @@ class LikelihoodMethod(Method):
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
             an offset: one-step forecasts are sharp, but long forecasts can drift without limit. A smaller share limits
             the drift.
-        units: units of a table's targets in the model; see `dvae.tables.encoding.TargetUnits`. None: the units whose
-            reference point is closest to the future in training windows (`PanelSchema.preferred`).
+        units: units of a table's targets in the model; see `dvae.tables.encoding.TargetUnits`. None: the units that
+            the training windows prefer (`PanelSchema.preferred`).
         scheduled_sampling: final probability that a step of x's history is the model's own mean. It rises from 0 over
             a third of training, after the first tenth. No gradient flows through these means. Models that read no x
             ignore it. None: 1 for data with a horizon that are not a table, and 0 for others.

@@ -186,8 +186,8 @@ def _scales(columns: Sequence[Column], sequences: Sequence[Series]) -> Iterator[
             ratios.append(f"{column.name!r} by a factor of {ratio:.3g}{fixed}")
     if ratios:
         yield (
-            f"the scale or level differs between sequences, of {', '.join(ratios)}; methods then use units of each "
-            "sequence unless one unit for all is closer to the data (--units series, changes, seasonal or columns)"
+            f"the scale or level differs between sequences, of {', '.join(ratios)}; methods use units of each "
+            "sequence if these are much closer to the data (--units series, changes, seasonal or columns)"
         )
 
 

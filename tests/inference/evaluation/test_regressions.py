@@ -89,7 +89,7 @@ def test_rare_counts_do_not_break_the_regression():
     assert coefficients.exp() < 1e-3
 
 
-@pytest.mark.filterwarnings("ignore::statsmodels.tools.sm_exceptions.ConvergenceWarning")
+@pytest.mark.filterwarnings("ignore:.*failed to converge")
 @pytest.mark.parametrize(("season", "steps"), [(None, 60), (4, 60), (4, 7), (30, 35)])
 def test_smoothing_agrees_with_statsmodels(season, steps):
     ets = pytest.importorskip("statsmodels.tsa.exponential_smoothing.ets")
