@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import smpl
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,6 @@ from dvae.motion.geometry import rotations
 from dvae.motion.segments.completion import simulate_observations
 from dvae.motion.segments.dataset import hold_out_sources
 from dvae.motion.segments.embodied import SegmentSchema
-from tests import smpl
 
 TAKES = {"SFU/0005/walk": "female", "CMU/01/walk": "male", "CMU/02/walk": "male", "KIT/3/walk": "female"}
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up to y up
