@@ -14,7 +14,18 @@ from ..data.batch import WHOLE
 from ..data.schema import Schema, SchemaError
 from ..data.sequences import RandomMasking, interpolate_missing
 from ..data.views import View
-from ..distributions import DistributionSpec, Family, FixedNormal, Flow, Mixture, Normal, Product, StudentT, Vamp
+from ..distributions import (
+    FAMILIES,
+    DistributionSpec,
+    Family,
+    FixedNormal,
+    Flow,
+    Mixture,
+    Normal,
+    Product,
+    StudentT,
+    Vamp,
+)
 from ..distributions.priors import VampModule
 from ..factorization.inversion import guide
 from ..factorization.notation import Factorization
@@ -286,9 +297,10 @@ def with_residual(distribution: Any, residual: float) -> Any:
         return replace(distribution, parts=parts)
     kind = distribution.kind.__name__ if isinstance(distribution, Family) else type(distribution).__name__
     if not hasattr(distribution, "residual") or (isinstance(distribution, Family) and kind != "Laplace"):
+        family = next((name for name, spec in FAMILIES.items() if spec == distribution), kind)
         raise ValueError(
-            f"residual is {residual}, but {kind} has no location to which the previous value can be added; leave "
-            'residual at 0, give these columns another family, such as real, or use units="changes"'
+            f"residual is {residual}, but the family {family!r} has no location to which the previous value can be "
+            "added; leave residual at 0, take the family real for these columns, or take the units changes"
         )
     return replace(distribution, residual=residual)
 

@@ -195,7 +195,7 @@ def test_residual_means_of_tables_add_the_previous_value():
     batch = windows.all().past(8)
     means = model.forecast(batch, 4, draw_emission=False)["x"][0]
     torch.testing.assert_close(means, batch["x"][:, -1:].expand_as(means), rtol=1e-5, atol=1e-4)
-    with pytest.raises(ValueError, match="Poisson has no location"):
+    with pytest.raises(ValueError, match="the family 'count' has no location"):
         method.of_columns(FAMILIES["count"])
 
 
