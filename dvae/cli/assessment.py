@@ -357,6 +357,7 @@ def compare(
     particles: int = 100,
     estimates: Expert[int] = 1,
     filter_particles: Expert[int] = 0,
+    leave_future_out: tuple[int, int] | None = None,
     contrasts: Expert[int] = 128,
     samples: int = 50,
     forecasts: bool = True,
@@ -378,6 +379,8 @@ def compare(
         particles: number K of particles of the IWAE bound.
         estimates: number of independent estimates of the IWAE bound; `to_arviz` of the result needs at least 25.
         filter_particles: number of particles of the FIVO bound; 0 omits it.
+        leave_future_out: L and M: also compare the log densities of M steps given all earlier ones, from L observed
+            steps on.
         contrasts: number of windows for the mutual information of latents and data; 0 omits it.
         samples: number of forecasts of each window.
         forecasts: also score forecasts, which takes longest.
@@ -409,6 +412,7 @@ def compare(
         particles=particles,
         estimates=estimates,
         filter_particles=filter_particles,
+        leave_future_out=leave_future_out,
         contrasts=contrasts,
         samples=samples if forecasts else 0,
         draw_emission=draw_emission,

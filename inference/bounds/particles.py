@@ -396,7 +396,7 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
                         f"{factor} reads {parent}, which {model.inference.factor(parent.name)} draws after all steps, "
                         f"so particles cannot be weighted at each step; {instead}"
                     )
-                if parent.name in step_names and _reads_ahead(parent, run.length):
+                if parent.name in step_names and reads_ahead(parent, run.length):
                     missing = " where entries are missing" if parent.name in hidden else ""
                     return (
                         f"{factor} reads {parent}, and {parent.name} after t is not drawn yet{missing} when the "
@@ -405,7 +405,8 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
     return ""
 
 
-def _reads_ahead(parent: Parent, length: int) -> bool:
+def reads_ahead(parent: Parent, length: int) -> bool:
+    """Return whether a local variable reads steps after its own of a local parent, in sequences of `length` steps."""
     assert parent.relation is not None
     if parent.relation.intervals is None:
         return bool(np.triu(parent.relation.mask(length), 1).any())

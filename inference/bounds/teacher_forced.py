@@ -20,6 +20,7 @@ from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence as SequenceDistribution
 from ..evaluation.evaluation_windows import on_device_of, refuse_non_finite
 from .elbo import SequenceELBO, iwae_bound, site_log_prob, sites_of
+from .leave_future_out import leave_future_out
 from .particles import fivo_bound
 
 _GUIDE_DRAWS = 8  # averaged for posterior means; the variance of the remaining noise is subtracted
@@ -108,6 +109,42 @@ def filtered(
         refuse_non_finite(name, "FIVO bound", bound.isfinite(), keys[part])
         values.append(bound.double().cpu())
     return {"FIVO bound": torch.cat(values).numpy()}
+
+
+def left_out(
+    name: str,
+    model: DynamicalVAE,
+    batch: Batch,
+    keys: Sequence[tuple[str, str, int]],
+    steps: tuple[int, int],
+    particles: int,
+    parts: Iterable[slice],
+) -> dict[str, np.ndarray]:
+    """Return leave-future-out densities, in nats per sequence, with their diagnostics.
+
+    Args:
+        name: name of the model, for errors.
+        model: model with its guide.
+        batch: batch of all N sequences.
+        keys: (split, cluster, first step) of each sequence, for errors.
+        steps: (L, M), numbers of observed and of forecast steps.
+        particles: K, number of particles of each estimate.
+        parts: slices of the sequences, evaluated one after another.
+
+    Returns:
+        "LFO", its Monte Carlo error "LFO error", the effective sample size "LFO particles", and "forecast steps", (N,)
+        each.
+
+    Raises:
+        FloatingPointError: when a density is not finite.
+    """
+    results = []
+    for part in parts:
+        result = leave_future_out(model, on_device_of(model, batch.rows(part)), *steps, particles)
+        refuse_non_finite(name, "leave-future-out density", result.elpd.isfinite(), keys[part])
+        results.append((result.elpd, result.error, result.effective, result.n_steps))
+    columns = [torch.cat(values).double().cpu().numpy() for values in zip(*results, strict=True)]
+    return dict(zip(("LFO", "LFO error", "LFO particles", "forecast steps"), columns, strict=True))
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:

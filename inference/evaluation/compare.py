@@ -17,10 +17,11 @@ from torch import Tensor, nn
 
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, Listed, axis_names, cluster_keys, sequences, take_split
+from ...options import Count, require
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..bounds.particles import obstacle
-from ..bounds.teacher_forced import bounds, filtered, information, length_of, variances
+from ..bounds.teacher_forced import bounds, filtered, information, left_out, length_of, variances
 from .comparison import Comparison, ModelResult
 from .evaluate import evaluate
 from .evaluation_windows import on_device_of, seeded_evaluation
@@ -39,6 +40,7 @@ def compare(
     particles: int = 100,
     estimates: int = 1,
     filter_particles: int = 0,
+    leave_future_out: tuple[int, int] | None = None,
     contrasts: int = 128,
     samples: int = 50,
     draw_emission: bool | None = None,
@@ -84,6 +86,9 @@ def compare(
             mean. `Comparison.to_arviz` needs 25 or more.
         filter_particles: K of the FIVO bound (`fivo_bound`); 0 omits it. For a model without a FIVO bound, such as
             one with a backward guide, a note gives the reason.
+        leave_future_out: (L, M) to add "LFO", the log density of each M steps given all earlier ones, from L observed
+            steps on (module `leave_future_out`), with K particles for each of its estimates. The bound compares models
+            by evidence, LFO by forecasts.
         contrasts: M, number of randomly drawn sequences among which information is measured; all sequences if there are
             fewer. 0 omits information.
         samples: number of forecasts per window for the free-running scores, which take longest; 0 omits them. Tensors,
@@ -115,6 +120,7 @@ def compare(
             "particles, estimates and batch_size must be at least 1, filter_particles, contrasts and samples at least "
             f"0, got {particles}, {estimates}, {batch_size}, {filter_particles}, {contrasts} and {samples}"
         )
+    require(tuple[Count, Count] | None, leave_future_out=leave_future_out)
     data = take_split(data, "test")
     windows = data if isinstance(data, HeldOutWindows) else None
     is_whole = windows is not None and windows.protocol.observed is None
@@ -149,7 +155,16 @@ def compare(
         }
     measured = {
         label: _score_model(
-            label, model, batch, keys, contrast_indices, particles, estimates, filter_particles, **shared
+            label,
+            model,
+            batch,
+            keys,
+            contrast_indices,
+            particles,
+            estimates,
+            filter_particles,
+            leave_future_out,
+            **shared,
         )
         | {"free_running": free_running[label]}
         for label, model in labelled.items()
@@ -177,6 +192,8 @@ def compare(
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
         filter_particles=filter_particles,
+        leave_future_out=tuple(leave_future_out or ()),
+        n_forecast=next(iter(measured.values())).get("forecast steps"),
         contrasts=len(contrast_indices),
         samples=samples,
         emission=emission,
@@ -198,6 +215,7 @@ def _score_model(
     particles: int,
     estimates: int,
     filter_particles: int,
+    leave_future_out: tuple[int, int] | None,
     *,
     seed: int,
     batch_size: int,
@@ -210,8 +228,15 @@ def _score_model(
             for start in bar.track(range(0, count, size), description=f"{label}, {kind}"):
                 yield slice(start, start + size)
 
+        future: dict[str, np.ndarray] = {}
+        if leave_future_out is not None:  # first, because it refuses some models
+            with seeded_evaluation(model, seed):
+                pieces = parts("leave-future-out", len(keys), batch_size)
+                future = left_out(label, model, batch, keys, leave_future_out, particles, pieces)
         with seeded_evaluation(model, seed):
             scores = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
+        scores["forecast steps"] = future.pop("forecast steps", None)
+        scores["bounds"] |= future
         scores["notes"] = []
         if filter_particles and (reason := obstacle(model, model.read(on_device_of(model, batch)))):
             scores["notes"].append(f"no FIVO bound: {reason}")
@@ -229,7 +254,7 @@ def _score_model(
 
 def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> ModelResult:
     """Return one model's row of the comparison from the scores of all its seeds; `model` is the model of any seed."""
-    excluded = {"steps", "notes"}
+    excluded = {"steps", "forecast steps", "notes"}
     scores = _stack([{key: value for key, value in seed.items() if key not in excluded} for seed in seeds])
     equations = {"generative": model.generative.text, "inference": model.inference.text}
     return ModelResult(
