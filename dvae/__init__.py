@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from .inference.evaluation.compare import compare
     from .inference.evaluation.comparison import Comparison
     from .inference.evaluation.conformal import PredictionBands, conformal_bands
+    from .inference.evaluation.ensemble import Ensemble
     from .inference.evaluation.evaluate import evaluate
     from .inference.evaluation.evaluation import Evaluation
     from .inference.training import schedules
@@ -73,6 +74,7 @@ __all__ = [
     "Descent",
     "Discrete",
     "DynamicalVAE",
+    "Ensemble",
     "Evaluation",
     "Evidence",
     "Factorization",
@@ -146,6 +148,7 @@ _MODULES = {
         "inference.evaluation.compare": "compare",
         "inference.evaluation.comparison": "Comparison",
         "inference.evaluation.conformal": "PredictionBands conformal_bands",
+        "inference.evaluation.ensemble": "Ensemble",
         "inference.evaluation.evaluate": "evaluate",
         "inference.evaluation.evaluation": "Evaluation",
         "inference.training": "schedules",

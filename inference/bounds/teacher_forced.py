@@ -20,7 +20,7 @@ from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence as SequenceDistribution
 from ..evaluation.evaluation_windows import on_device_of, refuse_non_finite
 from .elbo import SequenceELBO, iwae_bound, site_log_prob, sites_of
-from .leave_future_out import leave_future_out
+from .leave_future_out import LeaveFutureOut, leave_future_out
 from .particles import fivo_bound
 
 _GUIDE_DRAWS = 8  # averaged for posterior means; the variance of the remaining noise is subtracted
@@ -119,8 +119,8 @@ def left_out(
     steps: tuple[int, int],
     particles: int,
     parts: Iterable[slice],
-) -> dict[str, np.ndarray]:
-    """Return leave-future-out densities, in nats per sequence, with their diagnostics.
+) -> list[LeaveFutureOut]:
+    """Return the leave-future-out densities of each part of the sequences.
 
     Args:
         name: name of the model, for errors.
@@ -131,10 +131,6 @@ def left_out(
         particles: K, number of particles of each estimate.
         parts: slices of the sequences, evaluated one after another.
 
-    Returns:
-        "LFO", its Monte Carlo error "LFO error", the effective sample size "LFO particles", and "forecast steps", (N,)
-        each.
-
     Raises:
         FloatingPointError: when a density is not finite.
     """
@@ -142,9 +138,19 @@ def left_out(
     for part in parts:
         result = leave_future_out(model, on_device_of(model, batch.rows(part)), *steps, particles)
         refuse_non_finite(name, "leave-future-out density", result.elpd.isfinite(), keys[part])
-        results.append((result.elpd, result.error, result.effective, result.n_steps))
-    columns = [torch.cat(values).double().cpu().numpy() for values in zip(*results, strict=True)]
-    return dict(zip(("LFO", "LFO error", "LFO particles", "forecast steps"), columns, strict=True))
+        results.append(result)
+    return results
+
+
+def future_columns(parts: Sequence[LeaveFutureOut]) -> dict[str, np.ndarray]:
+    """Return density "", Monte Carlo "error", effective "particles" and forecast "steps" of N sequences, (N,) each."""
+    columns = {
+        "": [part.elpd for part in parts],
+        "error": [part.error for part in parts],
+        "particles": [part.effective for part in parts],
+        "steps": [part.n_steps for part in parts],
+    }
+    return {name: torch.cat(values).double().cpu().numpy() for name, values in columns.items() if values}
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:

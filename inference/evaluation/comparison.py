@@ -120,6 +120,7 @@ class Comparison(Result):
         filter_particles: K of the FIVO bound; 0 if it was not computed.
         leave_future_out: (L, M), numbers of observed and of forecast steps of "LFO"; empty if it was not computed.
         n_forecast: number of forecast steps of all origins in every sequence, (N,).
+        mixtures: number of models of each row that is an `Ensemble`; it counts as one seed.
 
     Example:
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
@@ -146,6 +147,7 @@ class Comparison(Result):
     filter_particles: int = 0
     leave_future_out: tuple[int, ...] = ()
     n_forecast: Annotated[np.ndarray, Dims("sequence")] | None = None
+    mixtures: dict[str, int] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> dict[str, Estimate]:
         row = self._row(name)
@@ -226,16 +228,16 @@ class Comparison(Result):
         Raises:
             ValueError: when sequences or settings differ, or both have a model of the same name.
         """
-        settings, other_settings = (
-            {**vars(each), "rows": None, "n_steps": None, "n_forecast": None} for each in (self, other)
-        )
+        of_rows = dict.fromkeys(("rows", "n_steps", "n_forecast", "mixtures"))
+        settings, other_settings = ({**vars(each), **of_rows} for each in (self, other))
         if different := [name for name, value in settings.items() if value != other_settings[name]]:
             raise ValueError(
                 f"comparisons to join may differ only in their models, but differ in {', '.join(different)}"
             )
         if shared := self.rows.keys() & other.rows.keys():
             raise ValueError(f"both comparisons have a model {', '.join(sorted(shared))}; rename one of them")
-        return dataclasses.replace(self, rows={**self.rows, **other.rows})
+        rows, mixtures = {**self.rows, **other.rows}, {**self.mixtures, **other.mixtures}
+        return dataclasses.replace(self, rows=rows, mixtures=mixtures)
 
     def table(self) -> Group:
         """Return three tables: bounds in the order of the ranking, use of the latents, free-running scores."""
@@ -430,6 +432,7 @@ class Comparison(Result):
                 "difference_to_best": _scored(self.difference(name, ranking[0])),
                 "khat_above_0.7": row.unreliable,
                 "active_units": row.active_units,
+                **({"mixture_of": self.mixtures[name]} if name in self.mixtures else {}),
                 **({"LFO_monte_carlo_error": self.monte_carlo_error(name)} if self.leave_future_out else {}),
             }
             for name, row in self.rows.items()
@@ -524,7 +527,8 @@ class Comparison(Result):
         )
         for name in self.ranking:
             behind = self._behind(name, self.ranking[0], "IWAE bound")
-            table.add_row(name, str(self.rows[name].seeds), str(self[name]["IWAE bound"]), behind, *cells[name])
+            seeds = f"mixture of {self.mixtures[name]}" if name in self.mixtures else str(self.rows[name].seeds)
+            table.add_row(name, seeds, str(self[name]["IWAE bound"]), behind, *cells[name])
         return table
 
     def _bound_cells(self) -> dict[str, list[str]]:

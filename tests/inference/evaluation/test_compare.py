@@ -324,14 +324,17 @@ CHEAP = ["--particles", "25", "--contrasts", "4"]
 def test_runs_that_differ_only_in_the_seed_share_a_row(runs, capsys, tmp_path):
     paths = [str(runs / name) for name in ("a0", "b", "a1", "c")]
     out, figure = tmp_path / "comparison.json", tmp_path / "comparison.png"
-    arguments = [*paths, *CHEAP, *LFO, "--samples", "2", "--out", str(out), "--figure", str(figure)]
+    arguments = [*paths, *CHEAP, *LFO, "--ensembles", "--samples", "2", "--out", str(out), "--figure", str(figure)]
     assert main(["compare", *arguments]) == 0
     output = capsys.readouterr().out
     for part in ("vae (latent 2)", "vae (latent 3)", "dkf", "K = 25", "free-running", "ADE", "LFO"):
         assert part in output
     result = Comparison.load(out)
     seeds = {name: row.seeds for name, row in result.rows.items()}
-    assert seeds == {"vae (latent 2)": 2, "vae (latent 3)": 1, "dkf": 1}
+    mixture = "vae (latent 2), mixture of 2 seeds"
+    assert seeds == {"vae (latent 2)": 2, "vae (latent 3)": 1, "dkf": 1, mixture: 1}
+    assert result.mixtures == {mixture: 2}
+    assert main(["compare", paths[1], "--ensembles"]) == 2
     assert result.rows["dkf"].config["method"]["latent"] == 2
     assert figure.read_bytes().startswith(b"\x89PNG")
 
