@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from .inference.training.objectives import Evidence
     from .inference.training.options import Stage, Training
     from .inference.training.svi import SVI
+    from .inference.training.weight_posterior import weight_posterior
     from .models.registry import method, methods
     from .program.enumeration import Discrete
     from .program.model import DynamicalVAE
@@ -123,6 +124,7 @@ __all__ = [
     "tables",
     "traverse",
     "views",
+    "weight_posterior",
 ]
 
 _MODULES = {
@@ -157,6 +159,7 @@ _MODULES = {
         "inference.training.objectives": "Evidence",
         "inference.training.options": "Stage Training",
         "inference.training.svi": "SVI",
+        "inference.training.weight_posterior": "weight_posterior",
         "models.registry": "method methods",
         "program.model": "DynamicalVAE",
         "program.rollout": "InputNoise ScheduledSampling",
