@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from .inference.diagnostics.reference_posterior import reference_posterior
     from .inference.diagnostics.stein import stein_discrepancy
     from .inference.diagnostics.traversal import traverse
+    from .inference.diagnostics.weight_posterior import weight_posterior
     from .inference.evaluation.compare import compare
     from .inference.evaluation.comparison import Comparison
     from .inference.evaluation.conformal import PredictionBands, conformal_bands
@@ -53,7 +54,6 @@ if TYPE_CHECKING:
     from .inference.training.objectives import Evidence
     from .inference.training.options import Stage, Training
     from .inference.training.svi import SVI
-    from .inference.training.weight_posterior import weight_posterior
     from .models.registry import method, methods
     from .program.enumeration import Discrete
     from .program.model import DynamicalVAE
@@ -146,6 +146,7 @@ _MODULES = {
         "inference.diagnostics.posteriors": "Descent Posterior posterior",
         "inference.diagnostics.stein": "stein_discrepancy",
         "inference.diagnostics.traversal": "traverse",
+        "inference.diagnostics.weight_posterior": "weight_posterior",
         "inference.diagnostics.reference_posterior": "reference_posterior",
         "inference.evaluation.compare": "compare",
         "inference.evaluation.comparison": "Comparison",
@@ -159,7 +160,6 @@ _MODULES = {
         "inference.training.objectives": "Evidence",
         "inference.training.options": "Stage Training",
         "inference.training.svi": "SVI",
-        "inference.training.weight_posterior": "weight_posterior",
         "models.registry": "method methods",
         "program.model": "DynamicalVAE",
         "program.rollout": "InputNoise ScheduledSampling",

@@ -85,13 +85,7 @@ def mixture(parts: Sequence[LeaveFutureOut]) -> LeaveFutureOut:
 
 @torch.no_grad()
 def leave_future_out(
-    model: DynamicalVAE,
-    batch: AnyBatch,
-    observed: int,
-    horizon: int = 1,
-    particles: int = 100,
-    *,
-    chunk: int = 4096,
+    model: DynamicalVAE, batch: AnyBatch, observed: int, horizon: int = 1, particles: int = 100, *, chunk: int = 4096
 ) -> LeaveFutureOut:
     """Return the leave-future-out log predictive density of every sequence; see the module.
 
@@ -112,14 +106,13 @@ def leave_future_out(
     require_likelihood(model)
     with model.running():
         data = model.read(batch)
-        size, length = require_data(model, data), data[model.observed[0]].shape[1]
+        size, length, past = require_data(model, data), model.rollout(data).length, model.view.past
         lengths = torch.full((size,), length) if data.lengths is None else data.lengths.cpu()
-        observed, least = observed - model.view.past, 0 if model.view.past else 1
-        if observed < least or min(horizon, particles) < 1 or observed + horizon > int(lengths.min()):
-            past = model.view.past
+        observed -= past  # these steps are context
+        if min(observed, horizon, particles) < 1 or observed + horizon > int(lengths.min()):
             raise ValueError(
-                f"leave-future-out needs at least {past + least} observed steps and at least 1 forecast step, together "
-                f"at most the {past + int(lengths.min())} of the shortest sequence, and at least 1 particle; got "
+                f"leave-future-out needs at least {past + 1} observed steps and at least 1 forecast step, together at "
+                f"most the {past + int(lengths.min())} of the shortest sequence, and at least 1 particle; got "
                 f"{past + observed}, {horizon} and {particles}"
             )
         _require_causal(model, data, length)
@@ -159,24 +152,23 @@ def _prefix(data: Batch, ends: Tensor) -> Batch:
     cut = data.map(lambda value: value[:, :longest] if value.dim() == 3 else value)
     if data.log_det is not None:
         cut["log_det"] = data.log_det[:, :longest] * valid_steps(ends.to(data.log_det.device), longest)
-    if (ends < longest).any():
-        return cut | {"lengths": ends.to(data[next(iter(data))].device)}
-    return Batch({name: value for name, value in cut.items() if name != "lengths"})
+    if data.lengths is not None:
+        cut["lengths"] = ends.to(data.lengths)
+    return cut
 
 
 def _evidences(model: DynamicalVAE, data: Batch, particles: int, chunk: int) -> tuple[Tensor, Tensor]:
     """Return R estimates of the log evidence, (R, B), and the effective sample size of the particles, (B,)."""
-    x = data[model.observed[0]]
-    exact = None
+    size, exact = require_data(model, data), None
     if not model.latents:
-        exact = importance_weights(model, data, len(x), 1, chunk)[0]
+        exact = importance_weights(model, data, size, 1, chunk)[0]
     else:
         with suppress(ValueError):  # not linear-Gaussian, or with context
-            exact = Oracle(model, x.shape[1]).evidence(data)
+            exact = Oracle(model, model.rollout(data).length).evidence(data)
     if exact is not None:
         return exact[None], torch.full_like(exact, particles)
     if obstacle(model, data):
-        weights = importance_weights(model, data, len(x), REPLICATES * particles, chunk)
+        weights = importance_weights(model, data, size, REPLICATES * particles, chunk)
         log_weights = weights.unflatten(0, (REPLICATES, -1)).transpose(0, 1)
         return log_weights.logsumexp(0) - math.log(particles), effective_size(log_weights).mean(0)
     bound = fivo_bound(model, repeat(data, REPLICATES), particles, chunk=chunk)

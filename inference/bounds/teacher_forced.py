@@ -20,7 +20,6 @@ from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence as SequenceDistribution
 from ..evaluation.evaluation_windows import on_device_of, refuse_non_finite
 from .elbo import SequenceELBO, iwae_bound, site_log_prob, sites_of
-from .leave_future_out import LeaveFutureOut, leave_future_out
 from .particles import fivo_bound
 
 _GUIDE_DRAWS = 8  # averaged for posterior means; the variance of the remaining noise is subtracted
@@ -109,48 +108,6 @@ def filtered(
         refuse_non_finite(name, "FIVO bound", bound.isfinite(), keys[part])
         values.append(bound.double().cpu())
     return {"FIVO bound": torch.cat(values).numpy()}
-
-
-def left_out(
-    name: str,
-    model: DynamicalVAE,
-    batch: Batch,
-    keys: Sequence[tuple[str, str, int]],
-    steps: tuple[int, int],
-    particles: int,
-    parts: Iterable[slice],
-) -> list[LeaveFutureOut]:
-    """Return the leave-future-out densities of each part of the sequences.
-
-    Args:
-        name: name of the model, for errors.
-        model: model with its guide.
-        batch: batch of all N sequences.
-        keys: (split, cluster, first step) of each sequence, for errors.
-        steps: (L, M), numbers of observed and of forecast steps.
-        particles: K, number of particles of each estimate.
-        parts: slices of the sequences, evaluated one after another.
-
-    Raises:
-        FloatingPointError: when a density is not finite.
-    """
-    results = []
-    for part in parts:
-        result = leave_future_out(model, on_device_of(model, batch.rows(part)), *steps, particles)
-        refuse_non_finite(name, "leave-future-out density", result.elpd.isfinite(), keys[part])
-        results.append(result)
-    return results
-
-
-def future_columns(parts: Sequence[LeaveFutureOut]) -> dict[str, np.ndarray]:
-    """Return density "", Monte Carlo "error", effective "particles" and forecast "steps" of N sequences, (N,) each."""
-    columns = {
-        "": [part.elpd for part in parts],
-        "error": [part.error for part in parts],
-        "particles": [part.effective for part in parts],
-        "steps": [part.n_steps for part in parts],
-    }
-    return {name: torch.cat(values).double().cpu().numpy() for name, values in columns.items() if values}
 
 
 def variances(model: DynamicalVAE, batch: Batch, parts: Iterable[slice]) -> dict[str, np.ndarray]:

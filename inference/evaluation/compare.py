@@ -22,12 +22,13 @@ from ...options import Count, require
 from ...program.model import DynamicalVAE
 from ..bounds.elbo import require_likelihood
 from ..bounds.leave_future_out import LeaveFutureOut, mixture
+from ..bounds.leave_future_out import leave_future_out as left_out_densities
 from ..bounds.particles import obstacle
-from ..bounds.teacher_forced import bounds, filtered, future_columns, information, left_out, length_of, variances
+from ..bounds.teacher_forced import bounds, filtered, information, length_of, variances
 from .comparison import Comparison, ModelResult
 from .ensemble import Ensemble, require_same
 from .evaluate import evaluate
-from .evaluation_windows import on_device_of, seeded_evaluation
+from .evaluation_windows import on_device_of, refuse_non_finite, seeded_evaluation
 from .record import plain
 from .result import progress_bar
 from .scores import Measure, Scores, proper
@@ -160,30 +161,16 @@ def compare(
             for label in forecasters
         }
     measured: dict[Any, dict[str, Any]] = {}
+    counts = particles, estimates, filter_particles, leave_future_out
     for label, model in labelled.items():
         if model not in measured:  # it may also be part of a mixture
-            measured[model] = _score_model(
-                label,
-                model,
-                batch,
-                keys,
-                contrast_indices,
-                particles,
-                estimates,
-                filter_particles,
-                leave_future_out,
-                **shared,
-            )
+            measured[model] = _score_model(label, model, batch, keys, contrast_indices, *counts, **shared)
     rows = {}
     for name, versions in contenders.items():
         labels_of_row = [name] if name in mixtures else [label for label, row, _ in _each(contenders) if row == name]
-        rows[name] = _contender(
-            versions[0],
-            [measured[model] for model in versions],
-            [free_running[label] for label in labels_of_row],
-            dict((configs or {}).get(name, {})),
-            name in mixtures,
-        )
+        scored, forecast = [measured[model] for model in versions], [free_running[label] for label in labels_of_row]
+        config = dict((configs or {}).get(name, {}))
+        rows[name] = _contender(versions[0], scored, forecast, config, name in mixtures)
     x = batch[next(iter(labelled.values())).observed[0]]
     return Comparison(
         rows=rows,
@@ -204,7 +191,7 @@ def compare(
         particles=particles,
         filter_particles=filter_particles,
         leave_future_out=tuple(leave_future_out or ()),
-        n_forecast=future_columns(next(iter(measured.values()))["left out"]).get("steps"),
+        n_forecast=_future_columns(next(iter(measured.values()))["left out"]).get("steps"),
         mixtures={name: len(value.models) for name, value in mixtures.items()},
         contrasts=len(contrast_indices),
         samples=samples,
@@ -243,8 +230,10 @@ def _score_model(
         future: list[LeaveFutureOut] = []
         if leave_future_out is not None:  # first, because it refuses some models
             with seeded_evaluation(model, seed):
-                pieces = parts("leave-future-out", len(keys), batch_size)
-                future = left_out(label, model, batch, keys, leave_future_out, particles, pieces)
+                for part in parts("leave-future-out", len(keys), batch_size):
+                    rows = on_device_of(model, batch.rows(part))
+                    future.append(left_out_densities(model, rows, *leave_future_out, particles))
+                    refuse_non_finite(label, "leave-future-out density", future[-1].elpd.isfinite(), keys[part])
         with seeded_evaluation(model, seed):
             scores = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
         scores |= {"left out": future, "notes": []}
@@ -289,12 +278,20 @@ def _contender(
             "estimates": np.logaddexp.reduce(scores["estimates"])[None] - math.log(len(seeds)),
         }
         future = [[mixture(parts) for parts in zip(*future, strict=True)]]
-    columns = _stack([future_columns(each) for each in future])
-    columns.pop("steps", None)
-    scores["bounds"] |= {f"LFO {name}".rstrip(): values for name, values in columns.items()}
+    columns = _stack([_future_columns(each) for each in future])
+    scores["bounds"] |= {name: values for name, values in columns.items() if name != "steps"}
     equations = {"generative": model.generative.text, "inference": model.inference.text}
     scores["estimates"] = scores["estimates"].mean(0)
     return ModelResult(equations, config, **scores, free_running=_stack(free_running), notes=seeds[0]["notes"])
+
+
+def _future_columns(parts: Sequence[LeaveFutureOut]) -> dict[str, np.ndarray]:
+    """Return density, Monte Carlo error, effective particles and forecast steps of N sequences, (N,) each."""
+    names = {"LFO": "elpd", "LFO error": "error", "LFO particles": "effective", "steps": "n_steps"}
+    return {
+        label: torch.cat([getattr(part, name) for part in parts]).double().cpu().numpy()
+        for label, name in (names if parts else {}).items()
+    }
 
 
 def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -95,6 +95,11 @@ class ModelResult:
         """Share of sequences whose k-hat is above 0.7; NaN if it was not estimated."""
         khat = self.bounds["k-hat"]
         return float((khat > KHAT)[~np.isnan(khat)].mean()) if not np.isnan(khat).all() else math.nan
+
+    @property
+    def few_particles(self) -> float:
+        """Share of sequences with fewer than 10 effective particles at a step of "LFO"."""
+        return float((self.bounds["LFO particles"] < EFFECTIVE).mean())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -358,19 +363,10 @@ class Comparison(Result):
                 DataArray(values, {"sequence": self.labels()["sequence"]}, ("sequence",))
                 for values in (row.bounds["LFO"].mean(0), particles)
             )
-            results[name] = ELPDData(
-                kind="lfo",
-                elpd=float(by_sequence.sum()),
-                se=float(by_sequence.std(ddof=1) * math.sqrt(size)),
-                p=math.nan,
-                n_samples=self.particles * REPLICATES,
-                n_data_points=size,
-                scale="log",
-                warning=bool((particles < EFFECTIVE).any()),
-                good_k=math.nan,
-                elpd_i=by_sequence,
-                n_eff_i=effective,
-            )
+            total, error = float(by_sequence.sum()), float(by_sequence.std(ddof=1) * math.sqrt(size))
+            few, draws = bool((particles < EFFECTIVE).any()), self.particles * REPLICATES
+            arrays = {"elpd_i": by_sequence, "n_eff_i": effective}
+            results[name] = ELPDData("lfo", total, error, math.nan, draws, size, "log", few, math.nan, **arrays)
         return results
 
     def to_arviz(self) -> dict[str, Any]:
@@ -503,61 +499,50 @@ class Comparison(Result):
     def _bound_table(self) -> Table:
         unit, cluster, step = self._words
         clustered = "" if unit.endswith(cluster) else f" (clustered by {cluster})"
-        bounds = (f"IWAE bound ↑\nK = {self.particles}", "difference to the best")
+        best = self.ranking[0]
+        columns: dict[str, Callable[[str], str]] = {
+            "seeds": lambda name: f"mixture of {n}" if (n := self.mixtures.get(name)) else str(self.rows[name].seeds),
+            f"IWAE bound ↑\nK = {self.particles}": lambda name: str(self[name]["IWAE bound"]),
+            "difference to the best": lambda name: self._behind(name, best, "IWAE bound"),
+        }
         if self.leave_future_out:
-            lines, columns, cells = self._future_cells()
+            observed, horizon = self.leave_future_out
+            first = max(self.rows, key=lambda name: self[name]["LFO"].mean)
+            columns |= {
+                f"LFO ↑\nL = {observed}, M = {horizon}": lambda name: str(self[name]["LFO"]),
+                "difference to\nthe best LFO": lambda name: self._behind(name, first, "LFO"),
+                "unreliable\nIWAE, LFO": lambda name: ", ".join(
+                    map(_percent, (self.rows[name].unreliable, self.rows[name].few_particles))
+                ),
+            }
+            errors = ", ".join(f"{name} {self.monte_carlo_error(name):.2g}" for name in self.ranking)
+            lines = [
+                f"LFO: log density of M {step}s given all earlier ones, from L {step}s on; its Monte Carlo standard "
+                f"error: {errors}",
+                f"unreliable: share of {unit}s with k-hat > {KHAT} (IWAE), and with fewer than {EFFECTIVE} effective "
+                f"particles at some step, of {self.particles} in each of {REPLICATES} estimates (LFO)",
+            ]
         else:
-            filters = [f"FIVO bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
+            columns |= {
+                "95 % (df)": lambda name: "–" if name == best else _interval(self.difference(name, best)),
+                "ELBO ↑": lambda name: str(self[name]["ELBO"]),
+            }
+            if self.filter_particles:
+                columns[f"FIVO bound ↑\nK = {self.filter_particles}"] = lambda name: str(
+                    self[name].get("FIVO bound", "–")
+                )
+            columns[f"k-hat\n> {KHAT}"] = lambda name: _percent(self.rows[name].unreliable)
             lines = [
                 "95 %: confidence interval from both errors (df: degrees of freedom of Student's t)",
                 f"k-hat > {KHAT}: share of {unit}s whose IWAE bound is unreliable",
             ]
-            columns, cells = ("95 % (df)", "ELBO ↑", *filters, f"k-hat\n> {KHAT}"), self._bound_cells()
-        table = _table(
-            f"{self._title()}\nteacher-forced, nats a {step}",
-            "\n".join(
-                [
-                    f"mean ± standard error over {unit}s{clustered} ± over seeds",
-                    *lines,
-                    *([] if self.samples else self.notes),
-                    *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),
-                ]
-            ),
-            ("seeds", *bounds, *columns),
-        )
+        lines = [f"mean ± standard error over {unit}s{clustered} ± over seeds", *lines]
+        lines += [] if self.samples else self.notes
+        lines += [f"{name}: {note}" for name, row in self.rows.items() for note in row.notes]
+        table = _table(f"{self._title()}\nteacher-forced, nats a {step}", "\n".join(lines), columns)
         for name in self.ranking:
-            behind = self._behind(name, self.ranking[0], "IWAE bound")
-            seeds = f"mixture of {self.mixtures[name]}" if name in self.mixtures else str(self.rows[name].seeds)
-            table.add_row(name, seeds, str(self[name]["IWAE bound"]), behind, *cells[name])
+            table.add_row(name, *(cell(name) for cell in columns.values()))
         return table
-
-    def _bound_cells(self) -> dict[str, list[str]]:
-        """Return the last cells of each model in the table of bounds."""
-        best, cells = self.ranking[0], {}
-        for name, row in self.rows.items():
-            interval = "–" if name == best else _interval(self.difference(name, best))
-            filtered = [str(self[name].get("FIVO bound", "–"))] if self.filter_particles else []
-            cells[name] = [interval, str(self[name]["ELBO"]), *filtered, _percent(row.unreliable)]
-        return cells
-
-    def _future_cells(self) -> tuple[list[str], tuple[str, ...], dict[str, list[str]]]:
-        """Return lines of the caption, and the last columns with their cells, of the table with "LFO"."""
-        (observed, horizon), (unit, _, step) = self.leave_future_out, self._words
-        errors = ", ".join(f"{name} {self.monte_carlo_error(name):.2g}" for name in self.ranking)
-        lines = [
-            f"LFO: log density of {horizon} {step}{'s' * (horizon > 1)} given all earlier ones, at least {observed}",
-            f"Monte Carlo standard error of LFO: {errors}",
-            f"unreliable: share of {unit}s with k-hat > {KHAT} (IWAE), and with fewer than {EFFECTIVE} effective "
-            f"particles at some step, of {self.particles} in each of {REPLICATES} estimates (LFO)",
-        ]
-        best = max(self.rows, key=lambda name: self[name]["LFO"].mean)
-        cells = {}
-        for name, row in self.rows.items():
-            few = float((row.bounds["LFO particles"] < EFFECTIVE).mean())
-            unreliable = f"{_percent(row.unreliable)}, {_percent(few)}"
-            cells[name] = [str(self[name]["LFO"]), self._behind(name, best, "LFO"), unreliable]
-        columns = (f"LFO ↑\nL = {observed}, M = {horizon}", "difference to the best", "unreliable\nIWAE, LFO")
-        return lines, columns, cells
 
     def _behind(self, name: str, best: str, metric: str) -> str:
         return "–" if name == best else str(self.difference(name, best, metric))

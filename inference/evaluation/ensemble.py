@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ...factorization.notation import Factorization
 from ...program.model import DynamicalVAE
 
 
@@ -42,20 +41,7 @@ class Ensemble(nn.Module):
         super().__init__()
         require_same("an ensemble", models)
         self.models = nn.ModuleList(models)
-
-    @property
-    def generative(self) -> Factorization:
-        """Generative factorization of the models."""
-        return self.models[0].generative  # type: ignore[return-value, union-attr]
-
-    @property
-    def inference(self) -> Factorization:
-        """Factorization of the guides."""
-        return self.models[0].inference  # type: ignore[return-value, union-attr]
-
-    def is_drawn(self, means: bool = False) -> bool:
-        """Return whether forecasts draw the data by default, as in `DynamicalVAE.is_drawn`."""
-        return self.models[0].is_drawn(means)  # type: ignore[no-any-return, operator, union-attr]
+        self.generative, self.inference, self.is_drawn = models[0].generative, models[0].inference, models[0].is_drawn
 
     def forecast(self, batch: Any, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
         """Return forecasts by name, (K, B, ...), of which each model draws K / S, in random order.

@@ -10,12 +10,12 @@ from torch.func import functional_call
 import dvae
 from dvae import DynamicalVAE, Oracle, linear_gaussian_surrogate, weight_posterior
 from dvae.distributions import FixedNormal
-from dvae.inference.training import weight_posterior as module
+from dvae.inference.diagnostics import weight_posterior as module
 from dvae.networks import Dense
 
 NOISE, SCALE = 0.5, 0.8
 QUIET = {"progress": False, "scale": SCALE}
-NAMES = ("model.generator.x.head.out.weight", "model.generator.x.head.out.bias")
+NAMES = ("generator.x.head.out.weight", "generator.x.head.out.bias")
 
 
 def regression():
@@ -69,9 +69,9 @@ def test_draws_of_nuts_have_the_moments_of_the_posterior():
     posterior = weight_posterior(model, x, chains=2, draws=150, warmup=60, members=5, **QUIET)
     mean, covariance = exact(x)
     draws, deviation = flat(posterior.draws), covariance.diagonal().sqrt()
-    assert posterior.rhat < 1.1
-    assert posterior.effective > 40
-    error = 4 / math.sqrt(posterior.effective)
+    assert posterior.sampling.rhat.max() < 1.1
+    assert posterior.sampling.effective.min() > 40
+    error = 4 / math.sqrt(posterior.sampling.effective.min())
     assert ((draws.mean(1) - mean).abs() < error * deviation).all()
     assert ((draws.std(1) / deviation - 1).abs() < error).all()
     assert len(posterior.ensemble.models) == 5
@@ -118,10 +118,11 @@ def test_latents_are_drawn_jointly_and_summed_out_latents_are_not():
     few = {"draws": 4, "warmup": 2, "chains": 2, "members": 2, **QUIET}
     posterior = weight_posterior(DynamicalVAE(*pair, Dense(())), x, **few)
     assert all(value.shape[0] == 8 for value in posterior.draws.values())
-    assert not posterior.converged
+    assert not posterior.sampling.converged.any()
+    assert posterior.sampling.rhat.shape == (1, 12 + 12)  # weights and latents
     assert not any(name.endswith("z") for name in posterior.draws)
     summed = DynamicalVAE("p(k_t | k_{t-1}) p(x_t | k_t)", "", {"k": dvae.Discrete(2), "x": 2}, Dense(()))
-    assert weight_posterior(summed, x, "laplace", **few).converged
+    assert weight_posterior(summed, x, "laplace", **few).sampling is None
 
 
 def test_unsupported_models_are_refused():

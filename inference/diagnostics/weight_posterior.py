@@ -10,7 +10,6 @@ linear-Gaussian model. Otherwise NUTS draws the latents of all sequences jointly
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import deepcopy
@@ -33,14 +32,11 @@ from ..bounds.elbo import log_densities, require_data, require_likelihood, total
 from ..evaluation.ensemble import Ensemble
 from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.result import progress_bar
+from .latents import Values, joined, split
+from .reference_posterior import Sampling, diagnose
 
 MOST = 2000
 """Largest number of weights and latent values; a Hessian has the square of their number."""
-
-Values = Mapping[str, Tensor]
-
-RHAT, EFFECTIVE = 1.01, 400
-"""Criteria of convergence: largest R-hat and smallest effective sample size of any weight (Vehtari et al., 2021)."""
 
 
 @dataclass(frozen=True)
@@ -50,20 +46,12 @@ class WeightPosterior:
     Args:
         ensemble: models with S of the draws, evenly spaced, for `evaluate` and `compare`.
         draws: draws of each parameter by name, (N, ...), in double precision.
-        rhat, effective: largest R-hat and smallest effective sample size of all weights; NaN for "laplace".
-        divergences: number of divergent transitions of NUTS.
+        sampling: convergence of NUTS, over all weights and sampled latents; None for "laplace".
     """
 
     ensemble: Ensemble
     draws: Mapping[str, Tensor]
-    rhat: float = math.nan
-    effective: float = math.nan
-    divergences: int = 0
-
-    @property
-    def converged(self) -> bool:
-        """Whether NUTS converged; always True for "laplace", which may be a bad approximation."""
-        return math.isnan(self.rhat) or (self.rhat <= RHAT and self.effective >= EFFECTIVE and not self.divergences)
+    sampling: Sampling | None
 
 
 class _LogDensity(nn.Module):
@@ -105,7 +93,7 @@ def weight_posterior(
     """Draw the weights of a small generative model from their posterior, given all sequences of a batch.
 
     Chains and the search for the mode start at the model's weights, so fit it first. Hidden units can be exchanged, so
-    a network has equivalent modes. If chains reach different ones, `rhat` is large although predictions agree. The
+    a network has equivalent modes. If chains reach different ones, R-hat is large although predictions agree. The
     guide keeps its weights, so bounds of the members are looser than those of the model that it was fitted with.
 
     Args:
@@ -142,31 +130,36 @@ def weight_posterior(
         data = copy.read(batch)
         require_data(copy, data)
         density = _LogDensity(copy, data)
-        start = {f"model.generator.{n}": p.detach() for n, p in copy.generator.named_parameters() if p.requires_grad}
+        weights = {f"generator.{n}": p.detach() for n, p in copy.generator.named_parameters() if p.requires_grad}
         latents = {name: value.detach() for name, value in copy.guide(data).items()} if density.sampled else {}
-        _require_supported(copy, data, method, start, latents)
+        _require_supported(copy, data, method, weights, latents)
+        template = {name: value[None] for name, value in (weights | latents).items()}
 
-        def energy(values: Values) -> Tensor:
+        def energy(flat: Tensor) -> Tensor:
             """Return the negative log density of weights, latents and data, up to a constant."""
-            weights = {name: values[name] for name in start}
-            prior = sum(value.square().sum() for value in weights.values()) / (2 * scale**2)
-            return prior - functional_call(density, weights, ({name: values[name] for name in latents},))
+            values = split(flat, template)
+            given = {name: values[name] for name in latents}
+            prior = sum(values[name].square().sum() for name in weights) / (2 * scale**2)
+            return prior - functional_call(density, {f"model.{name}": values[name] for name in weights}, (given,))
 
-        if not torch.isfinite(energy(start | latents)):
+        start, sampling = joined(template)[0], None
+        if not torch.isfinite(energy(start)):
             raise FloatingPointError("the log density is not finite at the model's weights; fit the model first")
-        diagnostics: dict[str, Any] = {}
         if method == "laplace":
             mode, root = laplace(energy, start)
             noise = torch.randn(len(mode), chains * draws, dtype=mode.dtype, device=mode.device)
-            drawn = _named(mode + torch.linalg.solve_triangular(root.T, noise, upper=True).T, start)
+            drawn = mode + torch.linalg.solve_triangular(root.T, noise, upper=True).T
         else:
             task = bar.add_task("drawing weights", total=chains * (warmup + draws))
-            drawn, diagnostics = _nuts(energy, start, latents, draws, chains, warmup, lambda *_: bar.advance(task))
-    indices = torch.linspace(0, len(next(iter(drawn.values()))) - 1, members).round().long()
-    return WeightPosterior(Ensemble([_with(model, drawn, index) for index in indices]), drawn, **diagnostics)
+            drawn, sampling = _nuts(energy, start, draws, chains, warmup, lambda *_: bar.advance(task))
+    members_of = [deepcopy(model) for _ in range(members)]
+    values = {name: value for name, value in split(drawn, template).items() if name in weights}
+    for member, index in zip(members_of, torch.linspace(0, len(drawn) - 1, members).round().long(), strict=True):
+        member.load_state_dict({name: value[index] for name, value in values.items()}, strict=False)
+    return WeightPosterior(Ensemble(members_of), values, sampling)
 
 
-def _require_supported(model: DynamicalVAE, data: Batch, method: str, start: Values, latents: Values) -> None:
+def _require_supported(model: DynamicalVAE, data: Batch, method: str, weights: Values, latents: Values) -> None:
     if model.grouped and data.group is not None:
         raise ValueError("sequences of a group have one joint density; remove 'group' from the batch")
     if latents and method == "laplace":
@@ -178,7 +171,7 @@ def _require_supported(model: DynamicalVAE, data: Batch, method: str, start: Val
         raise ValueError(
             "NUTS draws latents at padding without limits; give sequences of one length, without 'lengths'"
         )
-    counts = [sum(value.numel() for value in values.values()) for values in (start, latents)]
+    counts = [sum(value.numel() for value in values.values()) for values in (weights, latents)]
     if sum(counts) > MOST:
         raise ValueError(
             f"the model has {counts[0]:,} weights and {counts[1]:,} latent values to draw, more than {MOST:,}; use a "
@@ -187,79 +180,43 @@ def _require_supported(model: DynamicalVAE, data: Batch, method: str, start: Val
 
 
 def _nuts(
-    energy: Callable[[Values], Tensor],
-    start: Values,
-    latents: Values,
-    draws: int,
-    chains: int,
-    warmup: int,
-    advance: Callable[..., object],
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return draws by name, (C N, ...), and diagnostics of the weights."""
-    from arviz_stats.base import array_stats  # the import takes over a second
-
+    energy: Callable[[Tensor], Tensor], start: Tensor, draws: int, chains: int, warmup: int, advance: Callable[..., Any]
+) -> tuple[Tensor, Sampling]:
+    """Return draws (C N, P), chain by chain, and their convergence."""
     results, divergences = [], 0
     for _ in range(chains):  # all from the weights of the model, each with its own momenta
-        initial = {name: value.clone() for name, value in {**start, **latents}.items()}
-        run = MCMC(NUTS(potential_fn=energy), draws, warmup, initial, hook_fn=advance, disable_progbar=True)
+        kernel = NUTS(potential_fn=lambda values: energy(values["u"]))
+        run = MCMC(kernel, draws, warmup, {"u": start.clone()}, hook_fn=advance, disable_progbar=True)
         run.run()
-        results.append(run.get_samples())
+        results.append(run.get_samples()["u"])
         divergences += len(run.diagnostics()["divergences"]["chain 0"])
-    by_chain = {name: torch.stack([each[name] for each in results]) for name in start}
-    flat = torch.cat([value.flatten(2) for value in by_chain.values()], -1).cpu().numpy()
-    with np.errstate(divide="ignore", invalid="ignore"):  # chains that do not move
-        rhat, effective = (each(flat, chain_axis=0, draw_axis=1) for each in (array_stats.rhat, array_stats.ess))
-    largest, smallest = np.nan_to_num(rhat, nan=np.inf).max(), np.nan_to_num(effective).min()
-    diagnostics = {"rhat": float(largest), "effective": float(smallest), "divergences": divergences}
-    return {name: value.flatten(0, 1) for name, value in by_chain.items()}, diagnostics
+    rhat, effective = diagnose(torch.stack(results))
+    counts = np.array([divergences]), np.array([0])
+    return torch.cat(results), Sampling(rhat[None], effective[None], *counts, chains, draws, warmup)
 
 
-def laplace(energy: Callable[[Values], Tensor], start: Values) -> tuple[Tensor, Tensor]:
-    """Return the mode of exp(-energy) near `start`, (P,), and the Cholesky root (P, P) of the Hessian there.
-
-    Args:
-        energy: function of values by name.
-        start: values where the search starts; P numbers, in this order.
+def laplace(energy: Callable[[Tensor], Tensor], start: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mode of exp(-energy) near a start (P,), and the Cholesky root (P, P) of the Hessian there.
 
     Raises:
         ValueError: when there is no minimum of the energy nearby.
     """
-
-    def of(flat: Tensor) -> Tensor:
-        return energy(_named(flat, start))
-
-    mode = torch.cat([value.flatten() for value in start.values()]).requires_grad_()
+    mode = start.clone().requires_grad_()
     options: Any = {"tolerance_grad": 1e-9, "tolerance_change": 1e-14, "line_search_fn": "strong_wolfe"}
     optimiser = torch.optim.LBFGS([mode], max_iter=2000, history_size=50, **options)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
-        value = of(mode)
+        value = energy(mode)
         value.backward(inputs=[mode])
         return value
 
     optimiser.step(closure)
-    (gradient,) = torch.autograd.grad(of(mode), mode)
-    root, failed = torch.linalg.cholesky_ex(torch.autograd.functional.hessian(of, mode.detach()))
+    (gradient,) = torch.autograd.grad(energy(mode), mode)
+    root, failed = torch.linalg.cholesky_ex(torch.autograd.functional.hessian(energy, mode.detach()))
     if failed or gradient @ torch.cholesky_solve(gradient[:, None], root)[:, 0] > 1e-6:  # squared distance to the mode
         raise ValueError(
             "found no maximum of the log density near the model's weights; fit the model longer, or give the weights a "
             "narrower prior by a smaller `scale`"
         )
     return mode.detach(), root
-
-
-def _named(flat: Tensor, like: Values) -> dict[str, Tensor]:
-    """Return values by name from flat vectors (..., P), in the shapes of `like`."""
-    parts = zip(like.items(), flat.split([value.numel() for value in like.values()], -1), strict=True)
-    return {name: part.reshape(*part.shape[:-1], *value.shape) for (name, value), part in parts}
-
-
-def _with(model: DynamicalVAE, draws: Values, index: Tensor) -> DynamicalVAE:
-    """Return a copy of the model with the weights of one draw."""
-    copy = deepcopy(model)
-    with torch.no_grad():
-        for name, value in copy.generator.named_parameters():
-            if (key := f"model.generator.{name}") in draws:
-                value.copy_(draws[key][index])
-    return copy
