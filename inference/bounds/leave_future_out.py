@@ -34,8 +34,8 @@ from .particles import effective_size, fivo_bound, obstacle, reads_ahead
 REPLICATES = 5
 """R, number of independent estimates of each evidence."""
 
-EFFECTIVE = 10
-"""Effective sample size of particles below which an estimate is unreliable: a step's bias is then above 0.05 nats."""
+EFFECTIVE = 20
+"""Effective sample size below which an estimate is unreliable; a step then has a bias of about 1 / 40 nats or more."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class LeaveFutureOut:
     Args:
         logs: R estimates of the log evidences of the first and the last prefixes, (2, min(M, origins), R, B); R is 1 if
             they are exact.
-        effective: effective sample size of the K particles, (B,), the smallest over steps, as a mean over estimates.
+        effective: effective sample size of the K particles, (B,), the smallest over steps, as a mean over estimates;
+            infinite if the evidences are exact.
         n_steps: number of forecast steps of all origins, (B,).
     """
 
@@ -166,7 +167,7 @@ def _evidences(model: DynamicalVAE, data: Batch, particles: int, chunk: int) -> 
         with suppress(ValueError):  # not linear-Gaussian, or with context
             exact = Oracle(model, model.rollout(data).length).evidence(data)
     if exact is not None:
-        return exact[None], torch.full_like(exact, particles)
+        return exact[None], torch.full_like(exact, math.inf)
     if obstacle(model, data):
         weights = importance_weights(model, data, size, REPLICATES * particles, chunk)
         log_weights = weights.unflatten(0, (REPLICATES, -1)).transpose(0, 1)

@@ -32,7 +32,7 @@ from ..bounds.elbo import log_densities, require_data, require_likelihood, total
 from ..evaluation.ensemble import Ensemble
 from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.result import progress_bar
-from .latents import Values, joined, split
+from .latents import Values, joined, require_real, split
 from .reference_posterior import Sampling, diagnose
 
 MOST = 2000
@@ -167,6 +167,8 @@ def _require_supported(model: DynamicalVAE, data: Batch, method: str, weights: V
             f"'laplace' needs the exact evidence, but {', '.join(latents)} can only be sampled; use 'nuts', a model "
             "without latents or with networks.Linear and fixed scales, or dvae.Discrete latents"
         )
+    if latents:
+        require_real(model)
     if latents and data.lengths is not None:
         raise ValueError(
             "NUTS draws latents at padding without limits; give sequences of one length, without 'lengths'"

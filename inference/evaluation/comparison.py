@@ -98,7 +98,7 @@ class ModelResult:
 
     @property
     def few_particles(self) -> float:
-        """Share of sequences with fewer than 10 effective particles at a step of "LFO"."""
+        """Share of sequences with fewer than 20 effective particles at a step of "LFO"."""
         return float((self.bounds["LFO particles"] < EFFECTIVE).mean())
 
 
@@ -365,7 +365,7 @@ class Comparison(Result):
             )
             total, error = float(by_sequence.sum()), float(by_sequence.std(ddof=1) * math.sqrt(size))
             few, draws = bool((particles < EFFECTIVE).any()), self.particles * REPLICATES
-            arrays = {"elpd_i": by_sequence, "n_eff_i": effective}
+            arrays: Any = {"elpd_i": by_sequence, "n_eff_i": effective}
             results[name] = ELPDData("lfo", total, error, math.nan, draws, size, "log", few, math.nan, **arrays)
         return results
 

@@ -9,7 +9,7 @@ from torch.func import functional_call
 
 import dvae
 from dvae import DynamicalVAE, Oracle, linear_gaussian_surrogate, weight_posterior
-from dvae.distributions import FixedNormal
+from dvae.distributions import Family, FixedNormal
 from dvae.inference.diagnostics import weight_posterior as module
 from dvae.networks import Dense
 
@@ -134,6 +134,9 @@ def test_unsupported_models_are_refused():
         weight_posterior(model, {"x": x, "lengths": torch.tensor([4, 2, 3])}, progress=False)
     with pytest.raises(ValueError, match="weights and 2,400 latent values"):
         weight_posterior(model, torch.randn(600, 4, 2), progress=False)
+    positive = DynamicalVAE(*pair, Dense(()), {"p(z)": Family("LogNormal"), "q(z)": Family("LogNormal")})
+    with pytest.raises(ValueError, match="latents on the whole real line"):
+        weight_posterior(positive, x, progress=False)
     with pytest.raises(ValueError, match="unknown method 'vi'"):
         weight_posterior(model, x, "vi")
     with pytest.raises(ValueError, match="scale is 0"):
