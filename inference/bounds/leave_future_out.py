@@ -132,10 +132,8 @@ def leave_future_out(
 
 def _require_causal(model: DynamicalVAE, data: Batch, length: int) -> None:
     if model.grouped and data.group is not None:
-        raise ValueError(
-            f"groups share {', '.join(model.grouped)}, but leave-future-out is of one sequence; remove 'group' from "
-            "the batch"
-        )
+        names = ", ".join(model.grouped)
+        raise ValueError(f"groups share {names}, but densities are of one sequence; remove 'group' from the batch")
     if model.view.history is not None or (data.log_det is not None and data.log_det.dim() == 1):
         raise ValueError(f"leave-future-out needs a density of each step, which {model.view} does not have")
     for factor in model.generative.factors:

@@ -163,16 +163,12 @@ def _require_supported(model: DynamicalVAE, data: Batch, method: str, weights: V
     if model.grouped and data.group is not None:
         raise ValueError("sequences of a group have one joint density; remove 'group' from the batch")
     if latents and method == "laplace":
-        raise ValueError(
-            f"'laplace' needs the exact evidence, but {', '.join(latents)} can only be sampled; use 'nuts', a model "
-            "without latents or with networks.Linear and fixed scales, or dvae.Discrete latents"
-        )
+        names = ", ".join(latents)
+        raise ValueError(f"'laplace' needs the exact evidence, but {names} can only be sampled; use method='nuts'")
     if latents:
         require_real(model)
-    if latents and data.lengths is not None:
-        raise ValueError(
-            "NUTS draws latents at padding without limits; give sequences of one length, without 'lengths'"
-        )
+        if data.lengths is not None:
+            raise ValueError("NUTS cannot draw latents at padding; give sequences of one length, without 'lengths'")
     counts = [sum(value.numel() for value in values.values()) for values in (weights, latents)]
     if sum(counts) > MOST:
         raise ValueError(
@@ -218,7 +214,6 @@ def laplace(energy: Callable[[Tensor], Tensor], start: Tensor) -> tuple[Tensor, 
     root, failed = torch.linalg.cholesky_ex(torch.autograd.functional.hessian(energy, mode.detach()))
     if failed or gradient @ torch.cholesky_solve(gradient[:, None], root)[:, 0] > 1e-6:  # squared distance to the mode
         raise ValueError(
-            "found no maximum of the log density near the model's weights; fit the model longer, or give the weights a "
-            "narrower prior by a smaller `scale`"
+            "no maximum of the log density near the model's weights; fit it longer, or use a smaller `scale`"
         )
     return mode.detach(), root

@@ -96,11 +96,6 @@ class ModelResult:
         khat = self.bounds["k-hat"]
         return float((khat > KHAT)[~np.isnan(khat)].mean()) if not np.isnan(khat).all() else math.nan
 
-    @property
-    def few_particles(self) -> float:
-        """Share of sequences with fewer than 20 effective particles at a step of "LFO"."""
-        return float((self.bounds["LFO particles"] < EFFECTIVE).mean())
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Result):
@@ -508,12 +503,11 @@ class Comparison(Result):
         if self.leave_future_out:
             observed, horizon = self.leave_future_out
             first = max(self.rows, key=lambda name: self[name]["LFO"].mean)
+            few = {name: (row.bounds["LFO particles"] < EFFECTIVE).mean() for name, row in self.rows.items()}
             columns |= {
                 f"LFO ↑\nL = {observed}, M = {horizon}": lambda name: str(self[name]["LFO"]),
                 "difference to\nthe best LFO": lambda name: self._behind(name, first, "LFO"),
-                "unreliable\nIWAE, LFO": lambda name: ", ".join(
-                    map(_percent, (self.rows[name].unreliable, self.rows[name].few_particles))
-                ),
+                "unreliable\nIWAE, LFO": lambda name: f"{_percent(self.rows[name].unreliable)}, {_percent(few[name])}",
             }
             errors = ", ".join(f"{name} {self.monte_carlo_error(name):.2g}" for name in self.ranking)
             lines = [
