@@ -118,11 +118,18 @@ def slide(state: Any) -> None:
     """
     if isinstance(state, Rows):
         state.slide()
-    elif isinstance(state, dict | list | tuple):
-        for value in state.values() if isinstance(state, dict) else state:
-            slide(value)
-    elif is_dataclass(state) and not isinstance(state, type) and not state.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-        slide(vars(state))
+        return
+    kind = type(state)
+    if kind in (list, tuple):
+        parts = state
+    elif kind is dict:
+        parts = state.values()
+    elif is_dataclass(kind) and not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        parts = vars(state).values()
+    else:
+        return
+    for part in parts:
+        slide(part)
 
 
 Computed = TypeVar("Computed")

@@ -14,8 +14,9 @@ as the largest lag in the equations, and networks read the values in this window
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import nullcontext
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +27,7 @@ from torch.nn.functional import one_hot
 
 from ..distributions.base import Parameters
 from ..factorization.notation import Factor, Parent
+from ..locking import seeded
 from ..networks.base import indicator, presence
 from ..networks.loop import Rows, memoizing, pick, select, slide, valid_steps
 from .conditional import Conditional, like
@@ -42,6 +44,7 @@ class Particles:
         proposal: "guide" or "prior" for each latent; by default the guide for all.
         live: whether data and local context are added step by step (`feed`); `known` then has static values only, and
             its length is the number of steps in the window.
+        lag: largest lag of `state_probabilities`; the window must be longer.
     """
 
     def __init__(
@@ -51,8 +54,12 @@ class Particles:
         particles: int,
         proposal: Mapping[str, str] | None = None,
         live: bool = False,
+        lag: int = 0,
     ):
-        self.model, self.known, self.particles, self.live = model, known, particles, live
+        self.model, self.known, self.particles, self.live, self.lag = model, known, particles, live, lag
+        sums = model.sums
+        self.shape = (sums.n_static_states, sums.width**sums.lag, sums.width) if sums else (1, 1, 1)
+        """M, K^L and K: numbers of joint discrete states, of the static ones, a window of L steps, and a step."""
         self.proposal = dict(dict.fromkeys(model.latents, "guide") if proposal is None else proposal)
         self.order = [name for block in model.generative.blocks for name in block.names]
         self.data_names = self._local(model.observed)
@@ -68,12 +75,12 @@ class Particles:
             n for n in self.data_names if live or n in missing or (proposal is not None and n in self.read_now)
         ]
         self.shared = {name: value for name, value in known.values.items() if name not in self.hidden}
-        self.late = late_statics(model) if "guide" in self.proposal.values() else set()
+        self.late = late_statics(model) if proposal is None else set()
         self.sequence = torch.arange(known.batch, device=like(model).device).repeat(particles)
         self.statics: dict[str, Rows] = {}
         self.paths = self._slots([*self._local(model.latents), *self.hidden])
         if live:
-            local = [*self.data_names, *(name for name in model.context if self._is_local(name))]
+            local = [*self.data_names, *(name for name in model.context if model.reader.local[name])]
             self.data = self._slots([*local, *map(indicator, local), *map(presence, self._local(model.latents))])
             self.masks: dict[str, Any] = {name: self._slots([name])[name] for name in self._local(self.order)}
         else:
@@ -81,16 +88,13 @@ class Particles:
             masks = {name: known.mask(name) for name in self._local(self.order)}
             self.masks = {name: None if mask is None else self._by_step(mask) for name, mask in masks.items()}
             empty = self._slots(self.hidden)
+            self.data |= {presence(name): self._by_step(present) for name, present in known.present.items()}
             self.data |= {
                 indicator(n): self._by_step(known.observed[n]) if n in missing else empty[n] for n in self.hidden
             }
         self.position = -1
         self.noise: dict[str, Tensor] = {}
         self.ahead: dict[str, Parameters] = {}
-
-    def _is_local(self, name: str) -> bool:
-        equations = self.model.generative, self.model.inference
-        return any(each.local(name) for each in equations if name in (*each.variables, *each.context))
 
     def _local(self, names: Any) -> list[str]:
         return [name for name in names if self.model.generative.local(name)]
@@ -115,6 +119,8 @@ class Particles:
             }
             self.prior = {name: self._stepwise(model.generator[name], self.shared) for name in self._local(self.order)}
         self.states = self._start_states()
+        self.joint = self._joint()
+        self.past_states = self._slots(["joint", "logs"] if self.lag and model.summed else [])
         self.adopts = not self.guide and not self.read_now & {*self.data_names}
         """Whether predictions and weights need the same draws and network evaluations, as in a bootstrap filter."""
 
@@ -130,20 +136,25 @@ class Particles:
         if self.position < 0 and not self.statics:
             low = torch.zeros_like(low)
         if low.any():
-            rows = ancestors(self.log_weights, low)
-            names = ("statics", "paths", "guide", "prior", "states")
-            vars(self).update(zip(names, select([getattr(self, name) for name in names], rows), strict=True))
+            self._select(ancestors(self.log_weights, low))
             self.log_weights = self.log_weights.masked_fill(low, 0)
         if self.position == self.known.length - 1:
-            slide([self.paths, self.data, self.masks, self.guide, self.prior])
+            slide([self.paths, self.data, self.masks, self.guide, self.prior, self.past_states])
         self.position = min(self.position + 1, self.known.length - 1)
-        conditionals = {name: self.model.encoder[name] for name in self._local(self.model.latents)}
-        self.noise = {
-            name: each.head.noise((len(self.sequence), each.size), self.log_weights)
-            for name, each in conditionals.items()
-        }
+        self.noise = {name: self._noise(self.model.encoder[name]) for name in self._local(self.model.latents)}
         self.ahead = {}
         return low
+
+    def _select(self, rows: Tensor, *names: str) -> None:
+        """Replace particles by those with these rows (N,)."""
+        names = ("statics", "paths", "guide", "prior", "states", "past_states", *names)
+        vars(self).update(zip(names, select([getattr(self, name) for name in names], rows), strict=True))
+
+    def fork(self) -> Particles:
+        """Return a copy whose steps do not change these particles."""
+        forked = copy(self)
+        forked._select(torch.arange(len(self.sequence), device=self.sequence.device), "data", "masks")
+        return forked
 
     def feed(self, run: Rollout, t: int, names: list[str]) -> None:
         """Add values of local variables at a step, and their masks, to the window of a stream.
@@ -154,10 +165,11 @@ class Particles:
             names: names of data or context.
         """
         for name in names:
+            observed: Tensor | None = None
             self.data[name][self.position] = pick(run.values[name][:, t], self.sequence)
-            observed = run.observed.get(name)
-            is_complete = observed is None or bool(observed[:, t].all())
-            self.data[indicator(name)][self.position] = None if is_complete else pick(observed[:, t], self.sequence)
+            if name in run.observed and not run.observed[name][:, t].all():
+                observed = pick(run.observed[name][:, t], self.sequence)
+            self.data[indicator(name)][self.position] = observed
         for name, present in run.present.items():
             self.data[presence(name)][self.position] = pick(present[:, t], self.sequence)
         for name, masks in self.masks.items():
@@ -172,37 +184,36 @@ class Particles:
             parameters = each.step(t, reads)
             self.paths[name][t] = each.conditional.draw(parameters, self.noise[name])
             total = total - _log_prob(each.conditional, parameters, self.paths[name][t], _at(self.masks[name], t))
-        history, joint = {**self.data, **self.paths}, self._joint()
+        history, start = {**self.data, **self.paths}, self._joint()
+        logs = torch.zeros_like(start)
         for name, each in self.prior.items():
             parameters = self.ahead[name] if name in self.ahead else each.step(t, history)
             if name in self.model.summed:
-                joint = joint + each.logits(parameters, t)
+                logs = logs + each.logits(parameters, t)
                 continue
             is_drawn = self.proposal.get(name) == "prior"
             if is_drawn and not (self.adopts and self.ahead):
-                self.paths[name][t] = self._draw(each, parameters, name, joint)
+                self.paths[name][t] = self._draw(each, parameters, name, start + logs)
             value, mask = self.data[name][t] if name in self.data else self.paths[name][t], _at(self.masks[name], t)
             if each.places is None:
                 share = 0.0 if is_drawn else _log_prob(each.conditional, parameters, value, mask)
             else:
-                before, joint = joint.logsumexp(1), joint + each.densities(parameters, value, mask, t)
-                share = 0.0 if is_drawn else joint.logsumexp(1) - before
+                before, logs = (start + logs).logsumexp(1), logs + each.densities(parameters, value, mask, t)
+                share = 0.0 if is_drawn else (start + logs).logsumexp(1) - before
             total = total + share
             if name in self.hidden:  # the model reads its own mean where x is missing
                 observed = self.data[indicator(name)][t]
                 if observed is not None and each.places is None:
                     value = torch.where(observed, value, each.conditional.mean(parameters))
-                elif observed is not None and not observed.all():
-                    self.model.sums.require_data([name])
                 self.paths[name][t] = value
         self.log_weights = self.log_weights + total.view_as(self.log_weights)
-        if joint is not None:
-            self.joint = joint - joint.logsumexp(1, keepdim=True)
-            sums = self.model.sums
-            joint = self.joint.view(len(joint), sums.n_static_states, sums.width**sums.lag, sums.width)
-            if sums.lag:  # forget the oldest step of the window
-                joint = joint.flatten(-2).unflatten(-1, (sums.width, -1)).movedim(-2, -1)
-            self.states = joint.logsumexp(-1)
+        self.joint = (start + logs).log_softmax(1)
+        for name in self.past_states:
+            self.past_states[name][t] = self.joint if name == "joint" else logs
+        windows = self.joint.unflatten(1, self.shape)
+        if self.shape[1] > 1:  # forget the oldest step of the window
+            windows = windows.flatten(-2).unflatten(-1, (self.shape[2], -1)).movedim(-2, -1)
+        self.states = windows.logsumexp(-1)
 
     def predict(self) -> dict[str, tuple[Conditional, Parameters, Tensor]]:
         """Return the distribution of each local data variable at the step, before its data are used.
@@ -210,16 +221,14 @@ class Particles:
         Each is a mixture of C components per sequence: its conditional, its parameters (C B, ...) and the log weights
         (C, B). Latents are drawn from the model, with the noise of the step.
         """
-        t, joint, result = self.position, self._joint(), {}
+        t, joint, result, everyone = self.position, self._joint(), {}, torch.arange(len(self.sequence))
         history = overlay = {**self.data, **self.paths}
-        with _restored_random_state(self.adopts, like(self.model).device):
+        with nullcontext() if self.adopts else seeded(None, joint.device):  # later draws stay the same
             for name, each in self.prior.items():
                 if self.adopts or not (self.instant[name] or each.places is not None):
                     parameters = self.ahead[name] = each.step(t, history)
                 else:
-                    parameters = each.select(torch.arange(len(self.sequence), device=self.sequence.device)).step(
-                        t, overlay
-                    )
+                    parameters = each.select(everyone.to(joint.device)).step(t, overlay)
                 if name in self.model.summed:
                     joint = joint + each.logits(parameters, t)
                     continue
@@ -236,26 +245,22 @@ class Particles:
                     overlay = {**overlay, name: overlay[name].replaced(t, value)}
         return result
 
-    def _draw(self, each: Stepwise, parameters: Parameters, name: str, joint: Tensor | None) -> Tensor:
+    def _draw(self, each: Stepwise, parameters: Parameters, name: str, joint: Tensor) -> Tensor:
         """Draw values (N, D) of a variable from the model, given the joint weights of discrete states."""
-        noise = self.noise.get(name)
-        if noise is None:
-            noise = each.conditional.head.noise((len(self.sequence), each.conditional.size), self.log_weights)
-        if each.places is not None and joint is not None:
-            state = torch.multinomial(joint.softmax(1), 1)[:, 0]
-            count = len(state)
-            rows = each.places[self.position % len(each.places)][state] * count + torch.arange(
-                count, device=state.device
-            )
+        if each.places is not None:
+            place = each.place(self.position)[torch.multinomial(joint.softmax(1), 1)[:, 0]]
+            rows = place * len(place) + torch.arange(len(place), device=place.device)
             parameters = tuple(pick(p, rows) for p in parameters)
-        return each.conditional.draw(parameters, noise)
+        return each.conditional.draw(
+            parameters, self.noise[name] if name in self.noise else self._noise(each.conditional)
+        )
 
-    def _component_weights(self, each: Stepwise, joint: Tensor | None, t: int) -> Tensor:
+    def _component_weights(self, each: Stepwise, joint: Tensor, t: int) -> Tensor:
         """Return normalised log weights (C, B) of the components of a mixture."""
         weights = self.log_weights.log_softmax(0)
-        if each.places is None or joint is None:
+        if each.places is None:
             return weights
-        place = each.places[t % len(each.places)].expand(len(joint), -1)
+        place = each.place(t).expand(len(joint), -1)
         shares = joint.new_zeros(len(joint), each.patterns).scatter_add(1, place, joint.softmax(1))
         return (shares.t().log().unflatten(1, weights.shape) + weights).flatten(0, 1)
 
@@ -296,29 +301,65 @@ class Particles:
             stacked = {name: value * valid for name, value in stacked.items()}
         return {**{name: rows[0] for name, rows in self.statics.items()}, **stacked}
 
+    def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
+        """Return moments (B, D) of each latent, and of states their probabilities, `lag` steps ago given all data."""
+        values = {name: value.unflatten(0, self.log_weights.shape) for name, value in self.latents(lag).items()}
+        moments = {name: mixture(each, torch.zeros_like(each), self.log_weights) for name, each in values.items()}
+        mean, variance = ({name: pair[i] for name, pair in moments.items()} for i in range(2))
+        return {"mean": mean, "variance": variance, "states": self.state_probabilities(lag)}
+
+    def latents(self, lag: int = 0) -> dict[str, Tensor]:
+        """Return the draws (N, D) of each latent `lag` steps ago, of the ancestors; NaN where it is integrated out."""
+        t, draws = max(self.position - lag, 0), dict[str, Tensor]()
+        for name in self.model.latents:
+            draws[name] = self.paths[name][t] if name in self.paths else self.statics[name][0]
+            present = self.data[presence(name)][t] if presence(name) in self.data else None
+            if present is not None:
+                draws[name] = torch.where(present[:, None], draws[name], torch.nan)
+        return draws
+
     # Discrete states ----------------------------------------------------------------------------------------------
 
-    def _start_states(self) -> Tensor | None:
-        """Return log weights (N, M, K^L) of the discrete states before the first step; None without such states."""
-        sums, total = self.model.sums, self.log_weights.new_zeros(len(self.sequence), 1)
-        if sums is None:
-            return None
-        for name in sums.statics:
-            each = self._stepwise(self.model.generator[name], self.shared)
-            total = total + each.logits(each.state, 0)
-        for name in self.order:
-            if name in sums.readers and not self.model.generative.local(name):
+    def _start_states(self) -> Tensor:
+        """Return log weights (N, M, K^L) of the discrete states before the first step."""
+        total = self.log_weights.new_zeros(len(self.sequence), *self.shape).flatten(1)
+        for name in self.model.sums.windows if self.model.sums else ():
+            if not self.model.generative.local(name):
                 each = self._stepwise(self.model.generator[name], self.shared)
-                total = total + each.densities(each.state, pick(self.shared[name], self.sequence), None, 0)
-        static = total.view(len(total), sums.n_static_states, -1)[..., :1] if total.shape[1] > 1 else total[..., None]
+                if name in self.model.summed:
+                    total = total + each.logits(each.state, 0)
+                else:
+                    total = total + each.densities(each.state, pick(self.shared[name], self.sequence), None, 0)
+        static = total.unflatten(1, self.shape)[..., :1, 0]
         self.log_weights = self.log_weights + static.logsumexp((1, 2)).view_as(self.log_weights)
-        return static.expand(-1, sums.n_static_states, sums.width**sums.lag)
+        return static.expand(-1, *self.shape[:2])
 
-    def _joint(self) -> Tensor | None:
+    def state_probabilities(self, lag: int) -> dict[str, Tensor]:
+        """Return probabilities (B, C) of the discrete latents `lag` steps ago, given the data so far."""
+        t, sums = self.position, self.model.sums
+        if sums is None:
+            return {}
+        joint, later = self.joint, torch.zeros_like(self.states)
+        for s in range(t, max(t - lag, 0), -1):  # `later` is the log density of later data given the states so far
+            later = (self.past_states["logs"][s].unflatten(1, self.shape) + self._following(later)).logsumexp(-1)
+            joint = self.past_states["joint"][s - 1] + self._following(later).flatten(1)
+        weights = self.log_weights.softmax(0)[..., None]
+        total = (joint.softmax(1).unflatten(0, weights.shape[:2]) * weights).sum(0)
+        names = [*sums.statics, *(f"{name} {i}" for i in range(sums.lag, -1, -1) for name in sums.chain)]
+        total = total.unflatten(1, [sums.sizes[name.split(" ")[0]] for name in names])
+        axes = {n: names.index(n if n in sums.statics else f"{n} 0") + 1 for n in sums.sizes}
+        return {n: total.movedim(axis, 1).flatten(2).sum(2) if len(names) > 1 else total for n, axis in axes.items()}
+
+    def _following(self, values: Tensor) -> Tensor:
+        """Return values (N, M, K^L) of the windows after a step, for the windows and states at it, (N, M, K^L, K)."""
+        _, windows, width = self.shape
+        if windows == 1:
+            return values[..., None].expand(*values.shape, width)
+        return values[:, :, None].expand(-1, -1, width, -1).flatten(2).unflatten(2, (-1, width))
+
+    def _joint(self) -> Tensor:
         """Return log weights (N, J) of the joint discrete states, before any variable of the step."""
-        if self.states is None:
-            return None
-        return self.states[..., None].expand(*self.states.shape, self.model.sums.width).flatten(1)
+        return self.states[..., None].expand(*self.states.shape, self.shape[2]).flatten(1)
 
     # Static variables, and networks -------------------------------------------------------------------------------
 
@@ -329,7 +370,7 @@ class Particles:
             if not model.generative.local(name) and (name in self.late) == late and self.proposal[name] == "guide":
                 conditional = model.encoder[name]
                 parameters = self._parameters(conditional, self.known.values)
-                self.statics[name] = Rows([conditional.draw(parameters, self._static_noise(conditional))])
+                self.statics[name] = Rows([conditional.draw(parameters, self._noise(conditional))])
                 total = total - _log_prob(conditional, parameters, self.statics[name][0])
         for name in self.order:
             factor, conditional = model.generative.factor(name), model.generator[name]
@@ -338,13 +379,13 @@ class Particles:
                 continue
             parameters = self._parameters(conditional, self.shared)
             if self.proposal.get(name) == "prior":
-                self.statics[name] = Rows([conditional.draw(parameters, self._static_noise(conditional))])
+                self.statics[name] = Rows([conditional.draw(parameters, self._noise(conditional))])
                 continue
             value = self.statics[name][0] if name in self.statics else pick(self.shared[name], self.sequence)
             total = total + _log_prob(conditional, parameters, value)
         return total
 
-    def _static_noise(self, conditional: Conditional) -> Tensor:
+    def _noise(self, conditional: Conditional) -> Tensor:
         noise: Tensor = conditional.head.noise((len(self.sequence), conditional.size), like(self.model))
         return noise
 
@@ -444,7 +485,7 @@ class Stepwise:
             return tuple(parameter[t] for parameter in self.state)
         samples = {name: history[name] for name in self.reads}
         if self.patterns > 1:
-            samples = {name: _Tiled(rows, self.patterns) for name, rows in samples.items()}
+            samples = {name: [_tile(value, self.patterns) for value in rows] for name, rows in samples.items()}
         if self.given is None:
             parameters, self.state = self.conditional.step(self.state, t, samples)
             return parameters
@@ -466,14 +507,16 @@ class Stepwise:
 
     def densities(self, parameters: Parameters, value: Tensor, mask: Tensor | None, t: int) -> Tensor:
         """Return the log densities (N, J) of values (N, D) in the joint states of the discrete latents."""
-        n = self.patterns
-        tiled = None if mask is None else mask.repeat(n, *[1] * (mask.dim() - 1))
-        return self._placed(_log_prob(self.conditional, parameters, value.repeat(n, 1), tiled)[..., None], t)
+        value, mask = _tile(value, self.patterns), _tile(mask, self.patterns)
+        return self._placed(_log_prob(self.conditional, parameters, value, mask)[..., None], t)
+
+    def place(self, t: int) -> Tensor:
+        """Return the row of `places` at step t."""
+        assert self.places is not None
+        return self.places[t % len(self.places)]
 
     def _placed(self, logs: Tensor, t: int) -> Tensor:
-        assert self.places is not None
-        place = self.places[t % len(self.places)]
-        return logs.unflatten(0, (self.patterns, -1)).transpose(0, 1).flatten(1).index_select(1, place)
+        return logs.unflatten(0, (self.patterns, -1)).transpose(0, 1).flatten(1).index_select(1, self.place(t))
 
     def select(self, rows: Tensor) -> Stepwise:
         """Return the conditional for these particles."""
@@ -486,33 +529,8 @@ class Stepwise:
         return replace(self, state=state, given=None if self.given is None else select(dict(self.given), rows))
 
 
-class _Tiled:
-    """The values of `Rows`, repeated n times.
-
-    Args:
-        rows: values (N, D) by step.
-        count: n.
-    """
-
-    def __init__(self, rows: Rows, count: int):
-        self.rows, self.count = rows, count
-
-    def __getitem__(self, t: int) -> Any:
-        value = self.rows[t]
-        return None if value is None else value.repeat(self.count, *[1] * (value.dim() - 1))
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-
-@contextmanager
-def _restored_random_state(skip: bool, device: torch.device) -> Iterator[None]:
-    """Restore torch's random state after a block, unless `skip`, so that the block does not change later draws."""
-    module: Any = torch.cuda if device.type == "cuda" else torch
-    state = None if skip else module.get_rng_state()
-    yield
-    if state is not None:
-        module.set_rng_state(state)
+def _tile(value: Any, count: int) -> Any:
+    return None if value is None else value.repeat(count, *[1] * (value.dim() - 1))
 
 
 def is_windowed(conditional: Conditional) -> bool:
@@ -539,6 +557,18 @@ def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
     resampled = torch.searchsorted(cumulative.t().contiguous(), points.t().contiguous(), right=True).t()
     particle = torch.where(mask, resampled.clamp_(max=count - 1), identity)
     return (particle * batch + torch.arange(batch, device=identity.device)).flatten()
+
+
+def mixture(means: Tensor, variances: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and variance (B, D) of a mixture.
+
+    Args:
+        means, variances: moments (C, B, D) of the components.
+        log_weights: their log weights (C, B), which need not be normalised.
+    """
+    weights = log_weights.softmax(0)[..., None]
+    mean = (weights * means).sum(0)
+    return mean, (weights * (variances + (means - mean).square())).sum(0)
 
 
 def log_mean(log_weights: Tensor) -> Tensor:
