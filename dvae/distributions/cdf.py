@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from .hurdle import HurdleLogNormal
 from .precise import OffsetDistribution, _Wrapped
 from .product import ProductDistribution
 from .triangular import TriangularNormal
@@ -50,7 +51,8 @@ def cdf(distribution: Any, value: Tensor) -> tuple[Tensor, Tensor]:
         return (_special(distribution, value),) * 2
     if type(distribution).cdf is Distribution.cdf:
         return (torch.full_like(value, torch.nan),) * 2
-    return (distribution.cdf(value),) * 2
+    upto = distribution.cdf(value)
+    return (torch.where(value > 0, upto, 0.0) if isinstance(distribution, HurdleLogNormal) else upto), upto
 
 
 def _sums(distribution: Any, value: Tensor) -> tuple[Tensor, Tensor]:

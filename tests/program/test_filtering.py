@@ -11,6 +11,7 @@ from dvae import Discrete, DynamicalVAE, Oracle, SequenceELBO, fivo_bound, linea
 from dvae.data.series_units import SeriesPrior, SeriesUnits
 from dvae.data.views import Parts, View
 from dvae.distributions import Delta, Family, FixedNormal, Product, StudentT
+from dvae.distributions.family import FAMILIES, NormalMixture
 from dvae.factorization.notation import Factorization
 from dvae.networks import Attention, Dense, Linear, Recurrent
 
@@ -306,6 +307,9 @@ EMISSIONS = {
     "classes": (Family("OneHotCategorical"), 3),
     "positive": (Family("Gamma"), 2),
     "share": (Family("Beta"), 2),
+    "hurdle": (FAMILIES["hurdle"], 2),
+    "mixture": (NormalMixture(2), 2),
+    "low rank": (FAMILIES["correlated"], 2),
     "correlated": (Family("MultivariateNormal"), 2),
     "mixed": (Product((((0,), Family("Poisson")), ((1,), StudentT()))), 2),
 }
