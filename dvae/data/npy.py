@@ -7,8 +7,10 @@ programs need the memory.
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
+import zipfile
 from collections.abc import Callable
 from math import prod
 from mmap import mmap
@@ -27,6 +29,8 @@ LONGEST = 4096
 """Maximum bytes of a header."""
 NOTHING = 2**20
 """Maximum bytes of an empty array if dimensions of size 0 count as 1."""
+LARGEST = 2**32
+"""Maximum bytes of an unpacked npz file."""
 
 
 class NpyError(ValueError):
@@ -135,6 +139,44 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
             "write fewer, longer files",
             path,
         ) from error
+
+
+def read_npz(path: str | os.PathLike[str], links: bool = False) -> dict[str, np.ndarray]:
+    """Return the arrays of an npz file by name: numbers and text, without unpickling.
+
+    Args:
+        path: the file.
+        links: whether to follow a symbolic link; set it only for paths that the user typed.
+
+    Raises:
+        ValueError: if the path is a link or not a file, or the file is damaged, unpacks to more than `LARGEST` bytes,
+            or contains objects.
+        OSError: if it cannot be opened.
+    """
+    arrays = {}
+    with files.open_plain(path, links=links) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                if (size := sum(entry.file_size for entry in archive.infolist())) > LARGEST:
+                    raise NpyError(
+                        f"it unpacks to {size:,} bytes, at most {LARGEST:,} are read; write a single npy file"
+                    )
+                for entry in archive.infolist():
+                    with archive.open(entry) as member:
+                        content = io.BytesIO(member.read(entry.file_size))
+                    dtype, shape, order = header(content.read)
+                    values = content.getbuffer()[content.tell() :]
+                    if dtype.hasobject:
+                        raise NpyError(f"{entry.filename[:100]!r} contains Python objects, expected numbers or text")
+                    check_bytes(dtype, shape, len(values))
+                    arrays[entry.filename.removesuffix(".npy")] = np.frombuffer(values, dtype).reshape(
+                        shape, order=order
+                    )
+        except OSError:
+            raise
+        except Exception as error:  # the zip library raises many types for damaged bytes
+            raise ValueError(f"{os.fspath(path)} cannot be read as npz: {str(error)[:300]}") from error
+    return arrays
 
 
 def is_mapped(array: Any) -> bool:
