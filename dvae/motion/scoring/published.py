@@ -28,6 +28,8 @@ FAR = 100.0
 """Ratio of the mean positions in forecasts and data, or its inverse, above which a unit is doubtful."""
 
 Paper = Literal["dlow", "gsps", "humanmac"]
+Unit = Literal["m", "cm", "mm"]
+Root = Literal["subtract", "ignore"]
 
 
 def published_windows(windows: Windows, paper: Paper) -> Windows:
@@ -51,8 +53,8 @@ def frames_of(
     forecasts: Any,
     windows: Windows,
     axes: str = "kntd",
-    unit: Literal["m", "cm", "mm"] = "m",
-    root: Literal["subtract", "ignore"] | None = None,
+    unit: Unit = "m",
+    root: Root | None = None,
 ) -> ForecastSamples:
     """Return forecasts of joints as samples (K, N, T, D) in metres, as `dvae.evaluate` scores them.
 
@@ -75,8 +77,11 @@ def frames_of(
         >>> dvae.motion.frames_of(forecasts, windows, axes="nkt1jc", unit="mm").values.shape[2:]
         torch.Size([60, 48])
     """
+    require(Unit, unit=unit)
+    require(Root | None, root=root)
     samples = ForecastSamples.of(forecasts).arranged(axes)
-    values, columns, skeleton = samples.values * UNITS[unit], list(samples.columns), windows.skeleton
+    values = samples.values if unit == "m" else samples.values * UNITS[unit]
+    columns, skeleton = list(samples.columns), windows.skeleton
     if windows.protocol.root == "drop" and values.shape[-1] == 3 * skeleton.joints:
         joints = values.unflatten(-1, (-1, 3))
         path = joints[..., skeleton.root, :]
@@ -91,7 +96,7 @@ def frames_of(
         columns = columns[: 3 * skeleton.root] + columns[3 * skeleton.root + 3 :]
     elif root is not None:
         raise ValueError(f"root is {root!r}, but there is no root to remove from {values.shape[-1]} numbers of a frame")
-    ratio = float(values.abs().mean() / windows.all()["x"].abs().mean())
+    ratio = float(values.abs().float().mean() / windows.all()["x"].abs().mean())
     if not 1 / FAR < ratio < FAR and ratio:
         warnings.warn(f"positions are {ratio:.2g} times those of the data; is their unit {unit!r}?", stacklevel=2)
     return replace(samples, values=values, columns=columns)
