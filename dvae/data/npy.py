@@ -89,6 +89,14 @@ def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = 
         raise NpyError(f"{verb} shape {shape} of {dtype}, but holds {size:,} bytes{short}")
 
 
+def check_text(name: str, array: np.ndarray) -> None:
+    """Raise an `NpyError` if an array contains text with invalid characters."""
+    if array.dtype.kind == "U":
+        points = array.reshape(-1).view(f"{array.dtype.str[0]}u4")
+        if ((points > 0x10FFFF) | (points >> 11 == 0xD800 >> 11)).any():
+            raise NpyError(f"{name}: damaged: its text has invalid characters")
+
+
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
     """Return the numbers of an npy file as a read-only memory map; values are read from disk when they are used.
 
@@ -166,12 +174,12 @@ def read_npz(path: str | os.PathLike[str], links: bool = False) -> dict[str, np.
                         content = io.BytesIO(member.read(entry.file_size))
                     dtype, shape, order = header(content.read)
                     values = content.getbuffer()[content.tell() :]
+                    name = entry.filename.removesuffix(".npy")
                     if dtype.hasobject:
-                        raise NpyError(f"{entry.filename[:100]!r} contains Python objects, expected numbers or text")
+                        raise NpyError(f"{name[:100]!r} contains Python objects, expected numbers or text")
                     check_bytes(dtype, shape, len(values))
-                    arrays[entry.filename.removesuffix(".npy")] = np.frombuffer(values, dtype).reshape(
-                        shape, order=order
-                    )
+                    arrays[name] = np.frombuffer(values, dtype).reshape(shape, order=order)
+                    check_text(f"{name[:100]!r}", arrays[name])
         except OSError:
             raise
         except Exception as error:  # the zip library raises many types for damaged bytes

@@ -170,7 +170,12 @@ def evaluate(
             *dict.fromkeys([*eval_windows.notes, *(measure.note for measure in measures if measure.note)]),
             *(available.notes if references is True else ()),
             *_given_notes({name: count for name, (count, _) in external.items()}, samples if models else None),
-            *_forecast_notes(measures, samples, [name for name, each in is_drawn.items() if not each]),
+            *_forecast_notes(
+                measures,
+                samples,
+                [name for name, each in given.items() if each.emission == "mean"]
+                + [name for name, each in is_drawn.items() if not each],
+            ),
             *(
                 f"{name} is deterministic: its {samples} forecasts of a window are equal, and so is the best of them"
                 for name, each in models.items()

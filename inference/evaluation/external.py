@@ -59,12 +59,14 @@ class ForecastSamples:
             order of the evaluation.
         columns: names of the D columns; empty if unknown.
         sequences: name of the sequence of each window, "" if unknown, to check the order; empty if all are unknown.
+        emission: "mean" if samples are known to be means of an emission distribution given draws of latents.
     """
 
     values: Any
     keys: Sequence[Key] | None = None
     columns: Sequence[str] = ()
     sequences: Sequence[str] = ()
+    emission: str = ""
 
     @classmethod
     def of(cls, given: Any, name: str = "forecasts") -> ForecastSamples:
@@ -95,13 +97,12 @@ class ForecastSamples:
         keys = [_key(key, name) for key in given] if is_keyed else None
         items = [_item(item, f"{name}[{n}]") for n, item in enumerate(given.values() if is_keyed else given)]
         values, columns, sequences = zip(*items, strict=True)
-        shapes = {
-            (tuple(window.shape), names): n for n, (window, names) in enumerate(zip(values, columns, strict=True))
-        }
-        if len(shapes) > 1 or values[0].ndim != 3:
-            examples = "; ".join(f"item {n}: {shape}" for shape, n in [*shapes.items()][:FEW])
+        kinds = [(tuple(window.shape), *names) for window, names in zip(values, columns, strict=True)]
+        if len({*kinds}) > 1 or values[0].ndim != 3:
+            other = next((n for n, kind in enumerate(kinds) if kind != kinds[0]), 0)
             raise ValueError(
-                f"{name!r} must have samples (K, T, D) of each window, with the same columns; got {examples}"
+                f"{name!r} must have samples (K, T, D) of each window, with one shape and one order of columns; item 0 "
+                f"has {kinds[0]!r:.300}, and item {other} has {kinds[other]!r:.300}"
             )
         return cls(torch.stack(values, 1), keys, columns[0], () if is_keyed else sequences)
 
@@ -153,8 +154,8 @@ class ForecastSamples:
             same = len(found) == len(expected) and all(a in ("", b) for a, b in zip(found, expected, strict=True))
             if found and expected and not same:
                 raise ValueError(
-                    f"{name!r} has the {kind} {', '.join(found[:MOST])}; expected, in this order, "
-                    f"{', '.join(expected[:MOST])}"
+                    f"{name!r} has the {kind} {[*found][:MOST]!r:.500}; expected, in this order, "
+                    f"{[*expected][:MOST]!r:.500}"
                 )
         values = tensor_of(self.values)
         values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
@@ -203,7 +204,9 @@ def _item(item: Any, name: str) -> tuple[Tensor, tuple[str, ...], str]:
     if isinstance(item, Tensor | np.ndarray):
         return tensor_of(item), (), ""
     if hasattr(item, "all_values"):  # a TimeSeries of darts: (T, D, K)
-        return torch.tensor(np.moveaxis(item.all_values(), -1, 0)), tuple(map(str, item.components)), ""
+        columns = tuple(map(str, item.components))
+        named = columns != tuple(map(str, range(len(columns))))  # darts' own numbers
+        return torch.tensor(np.moveaxis(item.all_values(), -1, 0)), columns if named else (), ""
     if hasattr(item, "samples"):  # a SampleForecast of gluonts: (K, T), or (K, T, D)
         values = torch.tensor(np.asarray(item.samples))
         return (values if values.ndim == 3 else values[..., None]), (), str(item.item_id or "")
@@ -283,7 +286,7 @@ def _of_arrays(arrays: Mapping[str, np.ndarray], observed: int | None) -> Foreca
     values, sequence = (next((arrays[n] for n in names if n in arrays), None) for names in NAMES.values())
     if values is None or values.dtype.kind not in "fiu":
         raise ValueError(
-            f"it contains {', '.join(arrays) or 'nothing'}; expected numbers `samples` (K, N, T, D), and the keys of "
+            f"it contains {[*arrays][:MOST]!r:.500}; expected numbers `samples` (K, N, T, D), and the keys of "
             "the windows in `sequence`, `start` and `split`"
         )
     start = arrays.get("start")
@@ -299,7 +302,7 @@ def _of_arrays(arrays: Mapping[str, np.ndarray], observed: int | None) -> Foreca
         keys = [(str(a), str(b), int(c)) for a, b, c in zip(split, sequence, start, strict=True)]
     columns = [str(name) for name in arrays.get("columns", ())]
     columns = columns or [f"{joint}_{axis}" for joint in arrays.get("joint_names", ()) for axis in "xyz"]
-    return ForecastSamples(values, keys, columns)
+    return ForecastSamples(values, keys, columns, emission=str(arrays.get("emission", "")))
 
 
 def _read_csv(file: Path) -> dict[str, np.ndarray]:
@@ -308,8 +311,7 @@ def _read_csv(file: Path) -> dict[str, np.ndarray]:
 
     content = files.read(file, LARGEST_CSV, links=True)
     try:
-        text = {"split": str, "sequence": str}
-        frame = pd.read_csv(io.BytesIO(content), dtype=text, float_precision="round_trip")
+        frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)  # NumPy parses numbers exactly
         axes = ["sequence", "start", "sample", "ahead"]
         if missing := [name for name in axes if name not in frame]:
             if any(name == "mean" or re.fullmatch(r"q\d+", name) for name in frame):
@@ -319,7 +321,8 @@ def _read_csv(file: Path) -> dict[str, np.ndarray]:
                 )
             raise ValueError(f"it has no column {missing[0]!r}; expected {', '.join(axes)}, and the columns to score")
         frame = frame if "split" in frame else frame.assign(split="")
-        keys = frame[["split", "sequence", "start"]].fillna({"split": "", "sequence": ""}).astype({"start": int})
+        frame = frame.astype(dict.fromkeys(axes[1:], int))
+        keys = frame[["split", "sequence", "start"]]
         names = [name for name in frame if name not in (*axes, "split")]
         window, first = pd.factorize(pd.MultiIndex.from_frame(keys))
         samples, sample = np.unique(frame["sample"], return_inverse=True)
@@ -336,7 +339,7 @@ def _read_csv(file: Path) -> dict[str, np.ndarray]:
                 f"{shape[2]} steps, with `ahead` from 1"
             )
         values = np.empty((len(frame), len(names)))
-        values[places] = frame[names].to_numpy(float)
+        values[places] = frame[names].replace("", "nan").astype(float)
     except Exception as error:  # pandas raises many types
         raise ValueError(f"{file} cannot be read as CSV of samples: {str(error)[:500]}") from error
     split, sequence, start = (np.array(part) for part in zip(*first, strict=True))
