@@ -143,20 +143,20 @@ class External:
             raise UsageError("--protocol, --given-windows, --axes, --unit and --root need --forecasts; leave them out")
         return names
 
-    def read(self, windows: Any) -> tuple[dict[str, ForecastSamples], Any]:
-        """Return the forecasts by name, and the windows to score."""
-        read = {path.stem: read_samples(path, windows.protocol.observed, self.axes) for path in self.forecasts}
+    def read(self, windows: Any, every: Any) -> tuple[dict[str, ForecastSamples], Any]:
+        """Return the forecasts by name, and the windows to score; forecasts of others in `every` are left out."""
+        observed, keys = windows.protocol.observed, windows.keys
+        read = {path.stem: read_samples(path, observed, self.axes).within(every.keys, keys) for path in self.forecasts}
         if self.given_windows:
-            keys = next(iter(read.values())).keys
-            if keys is None:
-                raise UsageError(f"--given-windows: {self.forecasts[0]} has no keys of its windows; leave it out")
-            known = {*keys}
-            places = [n for n, key in enumerate(windows.keys) if known & {key, ("", *key[1:])}]
+            known = {*(next(iter(read.values())).keys or ())}
+            places = [n for n, key in enumerate(keys) if known & {key, ("", *key[1:])}]
             if not places:
-                raise UsageError(f"--given-windows: {self.forecasts[0]} has none of the {len(windows)} windows")
+                raise UsageError(
+                    f"--given-windows: {self.forecasts[0]} has no keys of any of the {len(keys)} windows; leave it out"
+                )
+            chosen = f"{len(places)} of {len(keys)} windows, those of {self.forecasts[0].name}"
             is_table = hasattr(windows, "subset")
-            chosen = f"{len(places)} of {len(windows)} windows, those of {self.forecasts[0].name}"
-            windows = windows.subset(places) if is_table else windows.at([windows.keys[n] for n in places], chosen)
+            windows = windows.subset(places) if is_table else windows.at([keys[n] for n in places], chosen)
         if isinstance(windows, motion.Windows):
             read = {
                 name: motion.frames_of(each, windows, unit=self.unit, root=self.root) for name, each in read.items()
@@ -322,10 +322,12 @@ def _forecasts(
     else:
         data_set = source.open_at(data, protocol=external.protocol, missing=scoring.missing)
         windows = data_set.windows("test")
-    if scoring.windows_of and data_set.kind == "motion":
-        windows = motion.published_windows(windows, scoring.windows_of)
+    every = windows
+    if data_set.kind == "motion":
+        windows = motion.published_windows(windows, scoring.windows_of) if scoring.windows_of else windows
+        windows = motion.several_futures(windows) if scoring.several_futures else windows
     with arguments():
-        given, windows = external.read(windows)
+        given, windows = external.read(windows, every)
     temperature = scoring.control.temperature
     scores: Scores = loading.SCORES[data_set.kind]
     if data_set.kind == "motion":
@@ -333,7 +335,6 @@ def _forecasts(
         scores = partial(
             motion.scores, pose_prior=_pose_prior(scoring, data, windows.skeleton), classifiers=classifiers
         )
-        windows = motion.several_futures(windows) if scoring.several_futures else windows
         windows = scoring.control.windows(windows, loaded)
     elif inapplicable := [name for name in OF_MOTION if getattr(scoring, name) != getattr(ForecastScoring, name)]:
         raise UsageError(

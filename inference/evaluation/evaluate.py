@@ -109,11 +109,15 @@ def evaluate(
         ['energy score', 'variogram score', 'CRPS']
     """
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
-    given = {name: ForecastSamples.of(each, name) for name, each in models.items() if not isinstance(each, Forecasting)}
-    models = {name: each for name, each in models.items() if name not in given}
     _check(samples, batch_size, bound_particles, log_score_particles)
     eval_windows = prepare_windows(windows)
     windows = eval_windows.windows
+    given = {
+        name: ForecastSamples.of(each, name, eval_windows.observed)
+        for name, each in models.items()
+        if not isinstance(each, Forecasting)
+    }
+    models = {name: each for name, each in models.items() if name not in given}
     external = {name: each.aligned(eval_windows, name) for name, each in given.items()}
     measures = _measures(scores, windows)
     means = any(measure.of_means for measure in measures)

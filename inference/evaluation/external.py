@@ -69,13 +69,14 @@ class ForecastSamples:
     emission: str = ""
 
     @classmethod
-    def of(cls, given: Any, name: str = "forecasts") -> ForecastSamples:
+    def of(cls, given: Any, name: str = "forecasts", observed: int | None = None) -> ForecastSamples:
         """Return samples from an array, a mapping, a list or a file.
 
         Args:
             given: (K, N, T, D); a mapping from the key of a window to (K, T, D); a list with one item for each window,
                 each (K, T, D), a `SampleForecast` of gluonts or a `TimeSeries` of darts; or the path of a file.
             name: name of the row, for errors.
+            observed: number of observed steps of a window, as in `read_samples`.
 
         Raises:
             TypeError: the forecasts have another type, or contain no samples.
@@ -84,7 +85,7 @@ class ForecastSamples:
         if isinstance(given, ForecastSamples):
             return given
         if isinstance(given, str | os.PathLike):
-            return read_samples(given)
+            return read_samples(given, observed)
         if isinstance(given, Tensor | np.ndarray):
             return cls(given)
         if not isinstance(given, Mapping | list | tuple) or not given:
@@ -125,6 +126,21 @@ class ForecastSamples:
             )
         ordered = tensor_of(values).permute([*ones, *map(axes.index, order)])
         return replace(self, values=ordered.flatten(0, len(ones)).flatten(3))
+
+    def within(self, every: Sequence[Key], chosen: Sequence[Key]) -> ForecastSamples:
+        """Return the samples without the windows that are in `every` and not in `chosen`.
+
+        Args:
+            every: keys of all windows; without keys, samples of this number of windows are in this order.
+            chosen: keys of the windows to keep.
+        """
+        keys = every if self.keys is None and self.values.shape[1] == len(every) else self.keys
+        dropped = {*every} - {*chosen}
+        if keys is None or not dropped:
+            return self
+        dropped |= {("", *key[1:]) for key in dropped}
+        places = [place for place, key in enumerate(keys) if key not in dropped]
+        return replace(self, values=tensor_of(self.values)[:, places], keys=[keys[place] for place in places])
 
     def aligned(self, windows: EvaluationWindows, name: str) -> tuple[int, Forecaster]:
         """Return K, and a function from a slice of the windows to their futures (K, B, T, D).

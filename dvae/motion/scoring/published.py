@@ -79,7 +79,7 @@ def frames_of(
     """
     require(Unit, unit=unit)
     require(Root | None, root=root)
-    samples = ForecastSamples.of(forecasts).arranged(axes)
+    samples = ForecastSamples.of(forecasts, observed=windows.protocol.observed).arranged(axes)
     values = samples.values if unit == "m" else samples.values * UNITS[unit]
     columns, skeleton = list(samples.columns), windows.skeleton
     if windows.protocol.root == "drop" and values.shape[-1] == 3 * skeleton.joints:

@@ -252,7 +252,7 @@ def test_files_that_forecasts_of_tables_wrote_are_scored_or_refused_with_a_reaso
     forecasts = test.forecast(model, samples=45)
     forecasts.save(tmp_path / "own.npz")
     forecasts.save(tmp_path / "own.csv")
-    first = score(read_samples(tmp_path / "own.npz", observed=6), test)["theirs"]["CRPS"]
+    first = score(tmp_path / "own.npz", test)["theirs"]["CRPS"]
     assert first == score(forecasts.draws, test)["theirs"]["CRPS"]
     with pytest.raises(ValueError, match=r"own.npz: it names the first step of each future; pass `observed`"):
         read_samples(tmp_path / "own.npz")
