@@ -115,7 +115,6 @@ class External:
         forecasts: files of samples (npz, npy or CSV), each a row named after its file; `dvae data windows` writes the
             windows to forecast. Without runs, --data and the options of `dvae fit` for it define the windows.
         protocol: without runs: protocol that cuts windows of motion; by default the protocol of the skeleton.
-        given_windows: score only the windows in the first file.
         axes: a letter for each axis of the samples in npz and npy files: k samples, n windows, t steps, d columns, or j
             joints and c coordinates; 1 for an axis of size 1. By default kntd or kntjc.
         unit: for motion: unit of the forecasts.
@@ -125,45 +124,28 @@ class External:
 
     forecasts: tuple[Path, ...] = ()
     protocol: ProtocolName | None = None
-    given_windows: Expert[bool] = False
     axes: Expert[str] = ""
     unit: Expert[Unit] = "m"
     root: Expert[Root | None] = None
 
-    def names(self) -> list[str]:
-        """Return the names of the rows.
-
-        Raises:
-            UsageError: two files have the same name, or there are options for files and no file.
-        """
-        names = [path.stem for path in self.forecasts]
-        if len({*names}) < len(names):
+    def check(self) -> None:
+        """Raise a `UsageError` if two files have the same name, or options for files have no file."""
+        if len({path.stem for path in self.forecasts}) < len(self.forecasts):
             raise UsageError(f"--forecasts {' '.join(map(str, self.forecasts))}: give files with different names")
-        if not names and self != External():
-            raise UsageError("--protocol, --given-windows, --axes, --unit and --root need --forecasts; leave them out")
-        return names
+        if not self.forecasts and self != External():
+            raise UsageError("--protocol, --axes, --unit and --root need --forecasts; leave them out")
 
-    def read(self, windows: Any, every: Any) -> tuple[dict[str, ForecastSamples], Any]:
-        """Return the forecasts by name, and the windows to score; forecasts of others in `every` are left out."""
-        observed, keys = windows.protocol.observed, windows.keys
-        read = {path.stem: read_samples(path, observed, self.axes).within(every.keys, keys) for path in self.forecasts}
-        if self.given_windows:
-            known = {*(next(iter(read.values())).keys or ())}
-            places = [n for n, key in enumerate(keys) if known & {key, ("", *key[1:])}]
-            if not places:
-                raise UsageError(
-                    f"--given-windows: {self.forecasts[0]} has no keys of any of the {len(keys)} windows; leave it out"
-                )
-            chosen = f"{len(places)} of {len(keys)} windows, those of {self.forecasts[0].name}"
-            is_table = hasattr(windows, "subset")
-            windows = windows.subset(places) if is_table else windows.at([keys[n] for n in places], chosen)
+    def read(self, windows: Any, every: Any) -> dict[str, ForecastSamples]:
+        """Return the forecasts of windows by name, without those of the others in `every`."""
+        read = {path.stem: read_samples(path, windows.protocol.observed, self.axes) for path in self.forecasts}
+        read = {name: each.within(every.keys, windows.keys) for name, each in read.items()}
         if isinstance(windows, motion.Windows):
-            read = {
+            return {
                 name: motion.frames_of(each, windows, unit=self.unit, root=self.root) for name, each in read.items()
             }
-        elif self.unit != "m" or self.root:
+        if self.unit != "m" or self.root:
             raise UsageError("--unit and --root are for motion; leave them out")
-        return read, windows
+        return read
 
 
 def evaluate(
@@ -227,8 +209,10 @@ def evaluate(
     check_files(out, figure, ".json")
     if several_futures and control.exchange is not None:
         raise UsageError("--several-futures needs multimodal futures, which exchanged poses do not have; leave one out")
-    if external.names() and measure != "forecasts":
-        raise UsageError(f"--forecasts does not apply to --measure {measure}; leave it out")
+    external.check()
+    is_of_segments = bool(run) and loading.kind_of(run, data) == "segments"
+    if external.forecasts and (measure != "forecasts" or is_of_segments):
+        raise UsageError("--forecasts is for scores of forecasts, not for another --measure or for segments")
     if run and (external.protocol or source != CutOptions()):
         raise UsageError("the runs define the windows; leave --protocol and options for reading the data out")
     scoring = ForecastScoring(
@@ -249,13 +233,8 @@ def evaluate(
             raise UsageError(f"--measure {measure} has no figure; leave --figure out")
         _measure(measure, run, data, scoring, angles, realism, out, figure, seed=seed, batch_size=batch_size)
         return
-    settings: dict[str, Any] = {"bound_particles": bound_particles, "seed": seed, "batch_size": batch_size}
-    if run and loading.kind_of(run, data) == "segments":
-        if external.forecasts:
-            raise UsageError("--forecasts is for windows, and motion-latent generates whole segments; leave it out")
-        result, record = _segments(run, data, scoring, **settings)
-    else:
-        result, record = _forecasts(run, data, scoring, external, source, **settings)
+    score: Any = _segments if is_of_segments else partial(_forecasts, external=external, source=source)
+    result, record = score(run, data, scoring, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
     save_and_print(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
 
 
@@ -327,7 +306,7 @@ def _forecasts(
         windows = motion.published_windows(windows, scoring.windows_of) if scoring.windows_of else windows
         windows = motion.several_futures(windows) if scoring.several_futures else windows
     with arguments():
-        given, windows = external.read(windows, every)
+        given = external.read(windows, every)
     temperature = scoring.control.temperature
     scores: Scores = loading.SCORES[data_set.kind]
     if data_set.kind == "motion":
@@ -355,10 +334,9 @@ def _forecasts(
         options={} if temperature is None else {"temperature": temperature},
         **settings,
     )
-    parts = [f"-{scoring.windows_of}"] if scoring.windows_of else []
-    parts += ["-several-futures"] * scoring.several_futures + [f"-with-{name}" for name in given]
     record = loading.record("evaluation", loaded[0], data_set) if loaded else "evaluation"
-    return result, f"{record}{scoring.control}{''.join(parts)}"
+    subset = f"-{scoring.windows_of}" * bool(scoring.windows_of) + "-several-futures" * scoring.several_futures
+    return result, f"{record}{scoring.control}{subset}{''.join(f'-with-{name}' for name in given)}"
 
 
 def _measure(

@@ -7,14 +7,13 @@ programs need the memory.
 from __future__ import annotations
 
 import errno
-import io
 import os
 import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from math import prod
 from mmap import mmap
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -29,8 +28,6 @@ LONGEST = 4096
 """Maximum bytes of a header."""
 NOTHING = 2**20
 """Maximum bytes of an empty array if dimensions of size 0 count as 1."""
-LARGEST = 2**32
-"""Maximum bytes of an unpacked npz file."""
 
 
 class NpyError(ValueError):
@@ -149,41 +146,36 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
         ) from error
 
 
-def read_npz(path: str | os.PathLike[str], links: bool = False) -> dict[str, np.ndarray]:
+def npz_arrays(file: BinaryIO, most: int, names: Collection[str] = ()) -> dict[str, np.ndarray]:
     """Return the arrays of an npz file by name: numbers and text, without unpickling.
 
     Args:
-        path: the file.
-        links: whether to follow a symbolic link; set it only for paths that the user typed.
+        file: the open file.
+        most: maximum bytes of its content.
+        names: names of the arrays to read if there are several; all by default.
 
     Raises:
-        ValueError: if the path is a link or not a file, or the file is damaged, unpacks to more than `LARGEST` bytes,
-            or contains objects.
-        OSError: if it cannot be opened.
+        NpyError: if the file is damaged, unpacks to more bytes, or contains objects.
     """
     arrays = {}
-    with files.open_plain(path, links=links) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                if (size := sum(entry.file_size for entry in archive.infolist())) > LARGEST:
-                    raise NpyError(
-                        f"it unpacks to {size:,} bytes, at most {LARGEST:,} are read; write a single npy file"
-                    )
-                for entry in archive.infolist():
+    try:
+        with zipfile.ZipFile(file) as archive:
+            entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+            if (size := sum(entry.file_size for entry in entries.values())) > most:
+                raise NpyError(f"it unpacks to {size:,} bytes; at most {most:,} are read")
+            selected = {*entries} & {*names} if names and len(entries) > 1 else {*entries}
+            for name, entry in entries.items():
+                if name in selected:
                     with archive.open(entry) as member:
-                        content = io.BytesIO(member.read(entry.file_size))
-                    dtype, shape, order = header(content.read)
-                    values = content.getbuffer()[content.tell() :]
-                    name = entry.filename.removesuffix(".npy")
-                    if dtype.hasobject:
-                        raise NpyError(f"{name[:100]!r} contains Python objects, expected numbers or text")
-                    check_bytes(dtype, shape, len(values))
-                    arrays[name] = np.frombuffer(values, dtype).reshape(shape, order=order)
+                        dtype, shape, order = header(member.read)
+                        if dtype.hasobject:
+                            raise NpyError(f"{name[:100]!r} contains Python objects, expected numbers or text")
+                        check_bytes(dtype, shape, entry.file_size - member.tell())
+                        values = np.frombuffer(member.read(entry.file_size), dtype)
+                    arrays[name] = values.reshape(shape, order=order)
                     check_text(f"{name[:100]!r}", arrays[name])
-        except OSError:
-            raise
-        except Exception as error:  # the zip library raises many types for damaged bytes
-            raise ValueError(f"{os.fspath(path)} cannot be read as npz: {str(error)[:300]}") from error
+    except Exception as error:  # the zip library raises many types for damaged bytes
+        raise NpyError(f"cannot be read as npz: {str(error)[:300]}") from error
     return arrays
 
 

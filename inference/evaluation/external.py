@@ -29,7 +29,7 @@ from torch import Tensor
 
 from ... import files
 from ...data.blocks import hash_values
-from ...data.npy import mapped, read_npz
+from ...data.npy import mapped, npz_arrays
 from ...data.sequences import HeldOutWindows, columns_of, tensor_of
 from .baselines import Forecaster
 from .evaluation_windows import EvaluationWindows, prepare_windows
@@ -37,10 +37,12 @@ from .evaluation_windows import EvaluationWindows, prepare_windows
 Key = tuple[str, str, int]
 
 SUFFIXES = (".npz", ".npy", ".csv")
-LARGEST_CSV = 2**30
-"""Maximum bytes of a CSV file."""
+LARGEST, LARGEST_CSV = 2**32, 2**30
+"""Maximum bytes of an unpacked npz file, and of a CSV file; an npy file is mapped and may be larger."""
 NAMES = {"samples": ("samples", "forecasts", "draws"), "sequence": ("sequence", "clip")}
 """Names of members of an npz file; the further ones are those of `dvae forecast`."""
+AXES = ("sequence", "start", "sample", "ahead")
+"""Columns of a CSV file that place its rows."""
 ORDERS = ("kntd", "kntjc")
 """Axes of samples: k samples, n windows, t steps, and d columns or j groups of c columns."""
 FEW = 3
@@ -285,16 +287,15 @@ def read_samples(path: str | os.PathLike[str], observed: int | None = None, axes
         raise ValueError(f"{file} must end in one of {', '.join(SUFFIXES)}")
     if suffix == ".npy":
         samples = ForecastSamples(mapped(file, links=True))
-    else:
-        arrays = read_npz(file, links=True) if suffix == ".npz" else _read_csv(file)
+    with files.open_plain(file, links=True) as content:
         try:
-            samples = _of_arrays(arrays, observed)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{file}: {error}") from error
-    try:
-        return samples.arranged(axes or ORDERS[np.ndim(samples.values) == 5])
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+            if suffix == ".npz":
+                samples = _of_arrays(npz_arrays(content, LARGEST), observed)
+            elif suffix == ".csv":
+                samples = _of_table(files.read(file, LARGEST_CSV, links=True))
+            return samples.arranged(axes or ORDERS[np.ndim(samples.values) == 5])
+        except (OverflowError, TypeError, ValueError) as error:
+            raise ValueError(f"{file}: {str(error)[:500]}") from error
 
 
 def _of_arrays(arrays: Mapping[str, np.ndarray], observed: int | None) -> ForecastSamples:
@@ -321,43 +322,29 @@ def _of_arrays(arrays: Mapping[str, np.ndarray], observed: int | None) -> Foreca
     return ForecastSamples(values, keys, columns, emission=str(arrays.get("emission", "")))
 
 
-def _read_csv(file: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a CSV file, under the names of an npz file."""
+def _of_table(content: bytes) -> ForecastSamples:
+    """Return samples from a CSV file."""
     import pandas as pd
 
-    content = files.read(file, LARGEST_CSV, links=True)
-    try:
-        frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)  # NumPy parses numbers exactly
-        axes = ["sequence", "start", "sample", "ahead"]
-        if missing := [name for name in axes if name not in frame]:
-            if any(name == "mean" or re.fullmatch(r"q\d+", name) for name in frame):
-                raise ValueError(
-                    "it contains means and quantiles, which do not determine the scores; write samples: `dvae forecast "
-                    "RUN --out FILE.npz`"
-                )
-            raise ValueError(f"it has no column {missing[0]!r}; expected {', '.join(axes)}, and the columns to score")
-        frame = frame if "split" in frame else frame.assign(split="")
-        frame = frame.astype(dict.fromkeys(axes[1:], int))
-        keys = frame[["split", "sequence", "start"]]
-        names = [name for name in frame if name not in (*axes, "split")]
-        window, first = pd.factorize(pd.MultiIndex.from_frame(keys))
-        samples, sample = np.unique(frame["sample"], return_inverse=True)
-        steps, step = np.unique(frame["ahead"], return_inverse=True)
-        shape = len(samples), len(first), len(steps), len(names)
-        places = np.ravel_multi_index((sample, window, step), shape[:3])
-        if (
-            len({*places.tolist()}) != len(frame)
-            or len(frame) != np.prod(shape[:3])
-            or steps.tolist() != [*range(1, len(steps) + 1)]
-        ):
-            raise ValueError(
-                f"it has {len(frame)} rows; expected one for each of {shape[1]} windows, {shape[0]} samples and "
-                f"{shape[2]} steps, with `ahead` from 1"
-            )
-        values = np.empty((len(frame), len(names)))
-        values[places] = frame[names].replace("", "nan").astype(float)
-    except Exception as error:  # pandas raises many types
-        raise ValueError(f"{file} cannot be read as CSV of samples: {str(error)[:500]}") from error
-    split, sequence, start = (np.array(part) for part in zip(*first, strict=True))
-    arrays = {"split": split, "sequence": sequence, "start": start, "columns": np.array(names)}
-    return {"samples": values.reshape(shape), **arrays}
+    frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)  # NumPy parses numbers exactly
+    if missing := [name for name in AXES if name not in frame]:
+        summary = any(name == "mean" or re.fullmatch(r"q\d+", name) for name in frame)
+        raise ValueError(
+            "it contains means and quantiles, which do not determine the scores; `dvae forecast RUN --out FILE.npz` "
+            "writes samples"
+            if summary
+            else f"it has no column {missing[0]!r}; expected {', '.join(AXES)}, and the columns to score"
+        )
+    frame = (frame if "split" in frame else frame.assign(split="")).astype(dict.fromkeys(AXES[1:], int))
+    window, windows = pd.factorize(pd.MultiIndex.from_frame(frame[["split", "sequence", "start"]]))
+    index = [window, frame["sample"], frame["ahead"]]
+    table = frame.drop(columns=[*AXES, "split"]).set_index([*map(pd.Index, index)]).sort_index()
+    levels = [np.unique(values) for values in index]
+    count, k, steps = map(len, levels)
+    if not table.index.equals(pd.MultiIndex.from_product([*levels[:2], range(1, steps + 1)])):
+        raise ValueError(
+            f"it has {len(frame)} rows; expected one for each of {count} windows, {k} samples and {steps} steps, with "
+            "`ahead` from 1"
+        )
+    values = table.replace("", "nan").to_numpy(float).reshape(count, k, steps, -1).swapaxes(0, 1)
+    return ForecastSamples(values, [*windows], [*table.columns])

@@ -172,7 +172,7 @@ def test_a_root_is_removed_as_requested(arrays, windows):
         motion.frames_of(forecasts, windows, root="ignore")
     with pytest.raises(ValueError, match="unknown unit 'km'"):
         motion.frames_of(forecasts, windows, unit="km")
-    with pytest.warns(UserWarning, match=r"positions are 1e\+03 times those of the data; is their unit 'm'"):
+    with pytest.warns(UserWarning, match=r"positions are 1\.3e\+03 times those of the data; is their unit 'm'"):
         motion.frames_of(1000 * forecasts, windows)
 
 
