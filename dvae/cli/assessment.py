@@ -136,7 +136,7 @@ class External:
             raise UsageError("--protocol, --axes, --unit and --root need --forecasts; leave them out")
 
     def read(self, windows: Any, every: Any) -> dict[str, ForecastSamples]:
-        """Return the forecasts of windows by name, without those of the others in `every`."""
+        """Return the forecasts by name; windows that are in `every` only are left out."""
         read = {path.stem: read_samples(path, windows.protocol.observed, self.axes) for path in self.forecasts}
         read = {name: each.within(every.keys, windows.keys) for name, each in read.items()}
         if isinstance(windows, motion.Windows):

@@ -168,7 +168,7 @@ def test_a_root_is_removed_as_requested(arrays, windows):
         torch.testing.assert_close(read.values, forecasts, rtol=0, atol=1e-12)
     with pytest.raises(ValueError, match=r"the root, Pelvis, moves in these forecasts.*root='subtract'"):
         motion.frames_of(world, windows, axes="kntjc")
-    with pytest.raises(ValueError, match="there is no root to remove from 48 numbers"):
+    with pytest.raises(ValueError, match="frames of 48 numbers have no root"):
         motion.frames_of(forecasts, windows, root="ignore")
     with pytest.raises(ValueError, match="unknown unit 'km'"):
         motion.frames_of(forecasts, windows, unit="km")
