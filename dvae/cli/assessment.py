@@ -35,6 +35,8 @@ from .help import Expert
 
 MOST_REMEMBERED = 2**32
 """Maximum size in bytes of the training windows that references load; memory-mapped data may be larger."""
+AS_STORED = CutOptions()
+"""No options: data are read and cut as in the runs."""
 OBSERVATIONS = 50
 """Number of observations for the diversity of codes, as in the paper of Mix-and-Match."""
 
@@ -151,8 +153,8 @@ class External:
 def evaluate(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     control: Control,
-    external: External,
-    source: Expert[CutOptions],
+    external: External = External(),
+    source: Expert[CutOptions] = AS_STORED,
     angles: Angles = Angles(),
     realism: Quality = Quality(),
     data: str | None = None,
@@ -213,7 +215,7 @@ def evaluate(
     is_of_segments = bool(run) and loading.kind_of(run, data) == "segments"
     if external.forecasts and (measure != "forecasts" or is_of_segments):
         raise UsageError("--forecasts is for scores of forecasts, not for another --measure or for segments")
-    if run and (external.protocol or source != CutOptions()):
+    if run and (external.protocol or source != AS_STORED):
         raise UsageError("the runs define the windows; leave --protocol and options for reading the data out")
     scoring = ForecastScoring(
         samples, log_score_particles, pose_prior, classifier, control, missing, failed, several_futures, windows_of
@@ -253,8 +255,7 @@ def windows(
         part: part of the data.
     """
     check_files(out, None, ".npz")
-    data_set = source.open_at(source.data, protocol=source.protocol, missing=source.missing, representation=None)
-    arrays = windows_to_forecast(data_set.windows(part), whole=part != "test")
+    arrays = windows_to_forecast(source.open_at(source.data).windows(part), whole=part != "test")
     with files.atomic_write(out) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     count, observed, size = arrays["observed"].shape

@@ -96,9 +96,9 @@ class ForecastSamples:
                 f"{name!r} is {kind}; expected a model that forecasts, such as a DynamicalVAE (see "
                 "dvae.program.protocols.Forecasting for the methods that it needs), or samples (K, N, T, D)"
             )
-        is_keyed = isinstance(given, Mapping)
-        keys = [_key(key, name) for key in given] if is_keyed else None
-        items = [_item(item, f"{name}[{n}]") for n, item in enumerate(given.values() if is_keyed else given)]
+        keys = [_key(key, name) for key in given] if isinstance(given, Mapping) else None
+        listed = given.values() if isinstance(given, Mapping) else given
+        items = [_item(item, f"{name}[{n}]") for n, item in enumerate(listed)]
         values, columns, sequences = zip(*items, strict=True)
         kinds = [(tuple(window.shape), *names) for window, names in zip(values, columns, strict=True)]
         if len({*kinds}) > 1 or values[0].ndim != 3:
@@ -107,7 +107,7 @@ class ForecastSamples:
                 f"{name!r} must have samples (K, T, D) of each window, with one shape and one order of columns; item 0 "
                 f"has {kinds[0]!r:.300}, and item {other} has {kinds[other]!r:.300}"
             )
-        return cls(torch.stack(values, 1), keys, columns[0], () if is_keyed else sequences)
+        return cls(torch.stack(values, 1), keys, columns[0], sequences if keys is None else ())
 
     def arranged(self, axes: str) -> ForecastSamples:
         """Return the samples with their axes in the order (K, N, T, D).

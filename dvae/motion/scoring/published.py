@@ -1,8 +1,9 @@
 """Forecasts in the layouts of public evaluation scripts, and the windows that these scripts score.
 
 Sources: DLow (Yuan and Kitani 2020, arXiv:2003.08386), GSPS (Mao, Liu and Salzmann 2021, arXiv:2108.08422), BeLFusion
-(Barquero, Escalera and Palmero 2023, arXiv:2211.14304) and HumanMAC (Chen et al. 2023, arXiv:2302.03665). Their APD, ADE, FDE, MMADE and MMFDE are defined as in `metrics`: norms over all coordinates of a
-frame without the root, and the window among its own multimodal truths. They differ from `dvae.motion.scores` in two ways:
+(Barquero, Escalera and Palmero 2023, arXiv:2211.14304) and HumanMAC (Chen et al. 2023, arXiv:2302.03665). Their APD,
+ADE, FDE, MMADE and MMFDE are defined as in `metrics`: norms over all coordinates of a frame without the root, and the
+window among its own multimodal truths. They differ from `dvae.motion.scores` in two ways:
 
 | script | windows | CMD |
 |---|---|---|
@@ -94,10 +95,8 @@ def frames_of(
         values = skeleton.without_root(joints).flatten(-2)
         columns = columns[: 3 * skeleton.root] + columns[3 * skeleton.root + 3 :]
     elif root is not None:
-        raise ValueError(
-            f"root is {root!r}, but frames of {values.shape[-1]} numbers have no root to remove; leave it out"
-        )
-    ratio = float(values.abs().float().mean() / windows.all()["x"].abs().mean())
-    if not 1 / FAR < ratio < FAR and ratio:
+        raise ValueError(f"root is {root!r}, but frames of {values.shape[-1]} numbers have no root to remove")
+    ratio = float(values[:1].abs().mean() / windows.all()["x"].abs().mean())
+    if ratio >= FAR or 0 < ratio <= 1 / FAR:
         warnings.warn(f"positions are {ratio:.2g} times those of the data; is their unit {unit!r}?", stacklevel=2)
     return replace(samples, values=values, columns=columns)
