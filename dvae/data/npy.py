@@ -155,7 +155,7 @@ def npz_arrays(file: BinaryIO, most: int, names: Collection[str] = ()) -> dict[s
         names: names of the arrays to read if there are several; all by default.
 
     Raises:
-        NpyError: if the file is damaged, unpacks to more bytes, or contains objects.
+        NpyError: if the file is damaged, unpacks to more bytes, or contains objects or none of the arrays.
     """
     arrays = {}
     try:
@@ -164,6 +164,8 @@ def npz_arrays(file: BinaryIO, most: int, names: Collection[str] = ()) -> dict[s
             if (size := sum(entry.file_size for entry in entries.values())) > most:
                 raise NpyError(f"it unpacks to {size:,} bytes; at most {most:,} are read")
             selected = {*entries} & {*names} if names and len(entries) > 1 else {*entries}
+            if not selected:
+                raise NpyError(f"it holds {[*entries][:20]!r:.200}; expected arrays {', '.join(names)}")
             for name, entry in entries.items():
                 if name in selected:
                     with archive.open(entry) as member:

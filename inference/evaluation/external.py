@@ -17,6 +17,7 @@ import hashlib
 import io
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +38,7 @@ from .evaluation_windows import EvaluationWindows, prepare_windows
 Key = tuple[str, str, int]
 
 SUFFIXES = (".npz", ".npy", ".csv")
-LARGEST, LARGEST_CSV = 2**32, 2**30
+LARGEST, LARGEST_CSV = 2**32, 2**28
 """Maximum bytes of an unpacked npz file, and of a CSV file; an npy file is mapped and may be larger."""
 NAMES = {"samples": ("samples", "forecasts", "draws"), "sequence": ("sequence", "clip")}
 """Names of members of an npz file; the further ones are those of `dvae forecast`."""
@@ -89,7 +90,7 @@ class ForecastSamples:
         if isinstance(given, str | os.PathLike):
             return read_samples(given, observed)
         if isinstance(given, Tensor | np.ndarray):
-            return cls(given)
+            return cls(_on_cpu(given))
         if not isinstance(given, Mapping | list | tuple) or not given:
             kind = f"an empty {type(given).__name__}" if isinstance(given, Mapping | list | tuple) else brief(given)
             raise TypeError(
@@ -191,22 +192,14 @@ class ForecastSamples:
         if not all(split for split, *_ in given):  # unknown splits
             short = {key[1:]: key for key in keys} if len({key[1:] for key in keys}) == len(keys) else {}
             given = [key if key[0] else short.get(key[1:], key) for key in given]
-        places = {key: place for place, key in enumerate(given)}
-        problems = {
-            "given twice": [key for place, key in enumerate(given) if places[key] != place],
-            "missing": [key for key in keys if key not in places],
-            "not in the evaluation": [*places.keys() - {*keys}],
-        }
-        if any(problems.values()):
-            lists = "; ".join(
-                f"{kind}: {', '.join(map(str, sorted(found)[:FEW]))}" + (" …" if len(found) > FEW else "")
-                for kind, found in problems.items()
-                if found
-            )
+        missing, other = ([*(Counter(a) - Counter(b))] for a, b in ((keys, given), (given, keys)))
+        if missing or other:
             raise ValueError(
                 f"{name!r} has forecasts of {len(given)} windows, expected each of the {len(keys)} windows of the "
-                f"evaluation once; {lists}; keys are (split, sequence, first step)"
+                f"evaluation once, by its key (split, sequence, first step); {len(missing)} are missing, such as "
+                f"{missing[:FEW]}; {len(other)} are unknown or repeated, such as {other[:FEW]}"
             )
+        places = {key: place for place, key in enumerate(given)}
         return torch.tensor([places[key] for key in keys])
 
     def record(self) -> dict[str, Any]:
@@ -217,10 +210,16 @@ class ForecastSamples:
         return {"forecasts": {"shape": [*values.shape], "sha256": digest.hexdigest()}}
 
 
+def _on_cpu(values: Tensor | np.ndarray) -> Tensor:
+    """Return values as a tensor that NumPy can read, without a copy if possible."""
+    tensor = tensor_of(values).detach().cpu()
+    return tensor.float() if tensor.dtype == torch.bfloat16 else tensor
+
+
 def _item(item: Any, name: str) -> tuple[Tensor, tuple[str, ...], str]:
     """Return samples (K, T, D) of one window, names of columns, and the name of the sequence, if they are known."""
     if isinstance(item, Tensor | np.ndarray):
-        return tensor_of(item), (), ""
+        return _on_cpu(item), (), ""
     if hasattr(item, "all_values"):  # a TimeSeries of darts: (T, D, K)
         columns = tuple(map(str, item.components))
         named = columns != tuple(map(str, range(len(columns))))  # darts' own numbers

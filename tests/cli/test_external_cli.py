@@ -77,7 +77,9 @@ def test_an_outsider_forecasts_exported_windows(capsys, folder, tmp_path):
     assert dvae.Evaluation.load(tmp_path / "scores.json")["turned"]["CRPS"] == scores["flat"]["CRPS"]
     few = {name: values[2:5] for name, values in keys.items() if name != "columns"}
     np.savez(tmp_path / "few.npz", samples=samples[:, 2:5], **few)
-    assert "missing: ('test'," in failure(capsys, "evaluate", "--forecasts", tmp_path / "few.npz", *data(folder))
+    assert "are missing, such as [('test'," in failure(
+        capsys, "evaluate", "--forecasts", tmp_path / "few.npz", *data(folder)
+    )
     train = ["data", "windows", *map(str, data(folder)), "--out", str(out), "--part", "train"]
     assert main(train) == 0
     with np.load(out) as arrays:

@@ -131,12 +131,12 @@ def test_forecasts_stand_beside_models_and_references_and_are_neither(model, own
     assert "given forecasts" in str(score(samples, windows).table().title)
 
 
-def test_forecasts_in_lower_precision_and_integers_are_scored_in_the_precision_of_the_truth(own, windows):
-    samples, _ = own
-    rounded = samples.round().int()
-    assert score(rounded, windows)["theirs"]["CRPS"].mean == pytest.approx(
-        score(rounded.double(), windows)["theirs"]["CRPS"].mean, rel=1e-6
-    )
+@pytest.mark.parametrize("kind", [torch.int32, torch.bfloat16, torch.float16, torch.float32])
+def test_forecasts_of_other_types_are_scored_in_the_precision_of_the_truth(own, windows, kind):
+    rounded = own[0].to(kind)
+    rounded = rounded.requires_grad_() if kind.is_floating_point else rounded
+    expected = score(rounded.detach().double(), windows)["theirs"]["CRPS"].mean
+    assert score(rounded, windows)["theirs"]["CRPS"].mean == pytest.approx(expected, rel=1e-6)
 
 
 WRONG = {
@@ -153,16 +153,16 @@ WRONG = {
     "no samples": (lambda x, w: x[:0], r"shape \(0, 7, 3, 2\)"),
     "missing key": (
         lambda x, w: {key: x[:, n] for n, key in enumerate(w.keys) if n != 2},
-        r"forecasts of 6 windows, expected each of the 7 windows .* once; missing: \('array', '2', 0\); keys are",
+        r"forecasts of 6 windows, expected .*; 1 are missing, such as \[\('array', '2', 0\)\]; 0 are unknown",
     ),
     "unknown key": (
         lambda x, w: {("array", str(n + 1), 0): x[:, n] for n in range(N)},
-        r"missing: \('array', '0', 0\); not in the evaluation: \('array', '7', 0\)",
+        r"missing, such as \[\('array', '0', 0\)\]; 1 are unknown or repeated, such as \[\('array', '7', 0\)\]",
     ),
     "no key": (lambda x, w: {"a": x[:, 0]}, r"key 'a'; expected \(split, sequence, first step\) of a window"),
     "key twice": (
         lambda x, w: ForecastSamples(x, [("array", str(n // 2), 0) for n in range(N)]),
-        r"given twice: \('array', '0', 0\)",
+        r"3 are missing, .*; 3 are unknown or repeated, such as \[\('array', '0', 0\)",
     ),
     "unequal items": (
         lambda x, w: [x[:, n, : 2 + n % 2] for n in range(N)],
