@@ -69,14 +69,14 @@ class HurdleLogNormal(TorchDistribution):
         above = torch.where(value > 0, self.positive.cdf(value.clamp(min=1e-30)), 0.0)
         return torch.where(value < 0, 0.0, gate + (1 - gate) * above)
 
-    @torch.no_grad()
     @override
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        positive = self.positive.sample(torch.Size(sample_shape))
-        is_zero = torch.rand_like(positive) < self.gate_logits.sigmoid()
-        return torch.where(is_zero, 0.0, positive)
+        with torch.no_grad():
+            positive = self.positive.sample(torch.Size(sample_shape))
+            is_zero = torch.rand_like(positive) < self.gate_logits.sigmoid()
+            return torch.where(is_zero, 0.0, positive)
 
     def expand(self, batch_shape: Any, _instance: object = None) -> HurdleLogNormal:
         """Return the distribution with another batch shape."""
-        parts = (each.expand(batch_shape) for each in (self.gate_logits, self.loc, self.scale))
-        return HurdleLogNormal(*parts, validate_args=False)
+        gate_logits, loc, scale = (each.expand(batch_shape) for each in (self.gate_logits, self.loc, self.scale))
+        return HurdleLogNormal(gate_logits, loc, scale, validate_args=False)

@@ -28,8 +28,9 @@ from ...networks.loop import valid_steps
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
 from ...program.oracle import Oracle
+from ...program.particles import effective_size, reads_ahead
 from .elbo import importance_weights, require_data, require_likelihood
-from .particles import effective_size, fivo_bound, obstacle, reads_ahead
+from .particles import fivo_bound, obstacle
 
 REPLICATES = 5
 """R, number of independent estimates of each evidence."""
