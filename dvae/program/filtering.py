@@ -421,7 +421,9 @@ def _require_names(data: Batch, names: Collection[str]) -> None:
 
 def _checksum(model: Any) -> int:
     """Return a checksum of all parameters and buffers."""
-    values = (value.cpu().reshape(-1).view(torch.uint8).numpy() for value in model.state_dict().values())
+    layout = torch.contiguous_format  # the bytes of a column of a matrix, for example, are not adjacent
+    copies = (value.cpu().clone(memory_format=layout).reshape(-1) for value in model.state_dict().values())
+    values = (value.view(torch.uint8).numpy() for value in copies)
     return reduce(lambda checksum, value: zlib.crc32(value, checksum), values, 0)
 
 

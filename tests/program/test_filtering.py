@@ -525,6 +525,16 @@ def test_an_update_that_is_refused_changes_nothing():
     torch.testing.assert_close(stream.update(ZERO).log_evidence, other.update(ZERO).log_evidence, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("rows", [1, 3])
+def test_a_model_with_a_strided_buffer_resumes(rows, tmp_path):
+    model = pair_model("vrnn")
+    model.register_buffer("column", torch.ones(rows, 6)[:, 0])
+    stream = model.filter(ZERO, 5, seed=0)
+    stream.save(tmp_path / "state")
+    resumed = model.filter(resume=tmp_path / "state")
+    torch.testing.assert_close(stream.update(ZERO).log_evidence, resumed.update(ZERO).log_evidence, rtol=0, atol=0)
+
+
 def test_the_state_of_another_model_is_refused(tmp_path):
     start(ZERO, 5).save(tmp_path / "state")
     with pytest.raises(ValueError, match="for other weights"):
