@@ -157,17 +157,20 @@ class ForecastSamples:
         """
         count, horizon, size = windows.futures.shape
         shape, n_given = tuple(self.values.shape), count if self.keys is None else len(self.keys)
+        names = column_names(windows.windows)
         if len(shape) != 4 or shape[1:] != (n_given, horizon, size) or not shape[0]:
             hint = ""
             if len(shape) == 4 and shape[2] == windows.x.shape[1]:
                 hint = "; give only the steps to predict, without the observed ones"
             elif len(shape) == 4 and any(sorted(shape) == sorted((k, n_given, horizon, size)) for k in shape):
                 hint = "; change the order of the axes"
+            elif self.columns and len(self.columns) != size:
+                hint = f"; its columns are {[*self.columns][:MOST]!r:.500}, not {names[:MOST]!r:.500}"
             raise ValueError(
                 f"{name!r} has shape {shape}, expected samples (K, N, T, D) = (K, {n_given}, {horizon}, {size}){hint}"
             )
         for kind, found, expected in (
-            ("columns", self.columns, column_names(windows.windows)),
+            ("columns", self.columns, names),
             ("sequences", self.sequences, [sequence for _, sequence, _ in windows.keys]),
         ):
             same = len(found) == len(expected) and all(a in ("", b) for a, b in zip(found, expected, strict=True))
@@ -194,10 +197,11 @@ class ForecastSamples:
             given = [key if key[0] else short.get(key[1:], key) for key in given]
         missing, other = ([*(Counter(a) - Counter(b))] for a, b in ((keys, given), (given, keys)))
         if missing or other:
+            wrong = [("missing", missing), ("unknown or repeated", other)]
             raise ValueError(
                 f"{name!r} has forecasts of {len(given)} windows, expected each of the {len(keys)} windows of the "
-                f"evaluation once, by its key (split, sequence, first step); {len(missing)} are missing, such as "
-                f"{missing[:FEW]}; {len(other)} are unknown or repeated, such as {other[:FEW]}"
+                "evaluation once, by its key (split, sequence, first step)"
+                + "".join(f"; {len(k)} are {kind}, such as {k[:FEW]}" for kind, k in wrong if k)
             )
         places = {key: place for place, key in enumerate(given)}
         return torch.tensor([places[key] for key in keys])
@@ -292,6 +296,8 @@ def read_samples(path: str | os.PathLike[str], observed: int | None = None, axes
                 samples = _of_arrays(npz_arrays(content, LARGEST), observed)
             elif suffix == ".csv":
                 samples = _of_table(files.read(file, LARGEST_CSV, links=True))
+            if not axes and np.ndim(samples.values) not in map(len, ORDERS):
+                raise ValueError(f"samples have shape {np.shape(samples.values)}, expected (K, N, T, D); K may be 1")
             return samples.arranged(axes or ORDERS[np.ndim(samples.values) == 5])
         except (OverflowError, TypeError, ValueError) as error:
             raise ValueError(f"{file}: {str(error)[:500]}") from error

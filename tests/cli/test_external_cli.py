@@ -92,7 +92,7 @@ def test_wrong_arguments_are_refused(capsys, folder, tmp_path):
     for arguments, message, code in (
         (["--forecasts", folder / "own.csv", *data(folder)], "means and quantiles, which do not determine", 2),
         (["--forecasts", own, turned, *data(folder)], "give files with different names", 2),
-        (["--forecasts", turned, *data(folder)], "axes are 'kntd' for an array (2, 3)", 2),
+        (["--forecasts", turned, *data(folder)], "samples have shape (2, 3), expected (K, N, T, D)", 2),
         (["--forecasts", turned, "--axes", "kx", *data(folder)], "axes are 'kx'", 2),
         (["--forecasts", tmp_path / "absent.npz", *data(folder)], "absent.npz", 1),
         (["--forecasts", own], "--forecasts needs --data, or runs", 2),

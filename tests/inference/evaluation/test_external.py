@@ -153,7 +153,7 @@ WRONG = {
     "no samples": (lambda x, w: x[:0], r"shape \(0, 7, 3, 2\)"),
     "missing key": (
         lambda x, w: {key: x[:, n] for n, key in enumerate(w.keys) if n != 2},
-        r"forecasts of 6 windows, expected .*; 1 are missing, such as \[\('array', '2', 0\)\]; 0 are unknown",
+        r"forecasts of 6 windows, expected .*; 1 are missing, such as \[\('array', '2', 0\)\]$",
     ),
     "unknown key": (
         lambda x, w: {("array", str(n + 1), 0): x[:, n] for n in range(N)},
@@ -167,6 +167,10 @@ WRONG = {
     "unequal items": (
         lambda x, w: [x[:, n, : 2 + n % 2] for n in range(N)],
         r"item 0 has \(\(9, 2, 2\),\), and item 1 has \(\(9, 3, 2\),\)",
+    ),
+    "fewer named columns": (
+        lambda x, w: ForecastSamples(x[..., :1], columns=["b"]),
+        r"shape \(9, 7, 3, 1\), .*; its columns are \['b'\], not \['a', 'b'\]",
     ),
     "columns of other names": (
         lambda x, w: ForecastSamples(x, columns=["b", "a"]),
@@ -338,7 +342,7 @@ HOSTILE = {
         ),
         "must have one entry for each window",
     ),
-    "dimensions": (npz(("samples.npy", npy("(1, 1)"))), "axes are 'kntd' for an array"),
+    "dimensions": (npz(("samples.npy", npy("(1, 1)"))), "samples have shape"),
 }
 
 
