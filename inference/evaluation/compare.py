@@ -299,9 +299,10 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
     if not isinstance(models, Mapping):
         raise TypeError(f"models must be a mapping such as {{'srnn': model}}, not {type(models).__name__}")
     for name, value in models.items():
-        if not isinstance(value, nn.Module | Iterable):
+        if isinstance(value, Tensor | np.ndarray) or not isinstance(value, nn.Module | Iterable):
             raise TypeError(
-                f"{name!r} is a {type(value).__name__}; expected a DynamicalVAE, or a list of them, one for each seed"
+                f"{name!r} is a {type(value).__name__}; expected a DynamicalVAE, or a list of them, one for each seed "
+                "(`evaluate` scores forecasts without a model)"
             )
     if not models:
         raise ValueError("expected at least one row of models, got none")

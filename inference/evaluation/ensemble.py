@@ -71,8 +71,8 @@ def require_same(label: str, models: Sequence[Any]) -> None:
     """
     if not models:
         raise ValueError(f"expected at least one model in {label}, got none")
-    if wrong := next((model for model in models if not isinstance(model, DynamicalVAE)), None):
-        raise TypeError(f"{label} has a {type(wrong).__name__}; expected a DynamicalVAE for each seed")
+    if wrong := [type(model).__name__ for model in models if not isinstance(model, DynamicalVAE)]:
+        raise TypeError(f"{label} contains a value of type {wrong[0]}; expected a DynamicalVAE for each seed")
     specs = [(model.generative.text, model.inference.text, dict(model.sizes)) for model in models]
     if other := next((spec for spec in specs if spec != specs[0]), None):
         raise ValueError(

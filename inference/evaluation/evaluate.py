@@ -128,6 +128,8 @@ def evaluate(
     if clash := (models.keys() | given.keys()) & baselines.keys():
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
 
+    if not (models or given or baselines):
+        raise ValueError("expected at least one model, forecast or reference to score, got none")
     rows: dict[str, Row] = {}
     with progress_bar(progress) as bar:
 

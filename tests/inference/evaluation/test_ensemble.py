@@ -91,7 +91,13 @@ def test_forecasts_of_the_mixture_are_scored_like_those_of_a_model():
 def test_models_that_differ_in_more_than_weights_are_refused():
     with pytest.raises(ValueError, match="at least one model in an ensemble"):
         Ensemble([])
-    with pytest.raises(TypeError, match="has a Linear"):
+    with pytest.raises(TypeError, match="type Linear"):
         Ensemble([torch.nn.Linear(1, 1)])
+    with pytest.raises(TypeError, match="type NoneType"):
+        Ensemble([None])
+    with pytest.raises(TypeError, match="`evaluate` scores forecasts"):
+        compare({"theirs": torch.randn(5, 3, 2, 2)}, torch.randn(3, 4, 2))
+    with pytest.raises(ValueError, match="at least one model, forecast or reference"):
+        evaluate({}, ArrayWindows(torch.randn(3, 4, 2), 2), references=False)
     with pytest.raises(ValueError, match="must differ only in their seed"):
         Ensemble([DynamicalVAE("p(x_t | x_{t-1})", "", {"x": 2}), DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})])
