@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from ..capture import defer, is_deferring
 from ..data.batch import WHOLE, Batch
-from ..data.sequences import refuse_table, tensor_of
+from ..data.sequences import HeldOutWindows, has_splits, refuse_table, tensor_of
 from ..data.units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float32
 from ..data.views import View
 from ..distributions.product import ProductSupport
@@ -72,7 +72,7 @@ class Reader:
             wide: names of variables that are read in float64 whatever the dtype.
 
         Raises:
-            TypeError: if the batch is a table.
+            TypeError: if the batch is a table, or windows.
             ValueError: if the batch has names that the model does not know, a mask without its variable, tensors on the
                 meta device, or values that float32 does not resolve.
         """
@@ -86,6 +86,8 @@ class Reader:
                 raise ValueError(
                     f"a batch of {', '.join(self.observed)} must be a mapping of these names, not one tensor"
                 )
+            if isinstance(batch, HeldOutWindows) or has_splits(batch):
+                raise TypeError(f"got {type(batch).__name__}, expected a batch; give `windows.all()` of its windows")
             batch = {whole_name: batch}
         if unknown := [name for name in batch if name not in (*names, *self.extras, *Batch.reserved)]:
             raise ValueError(

@@ -225,6 +225,10 @@ class Filter:
             self._build(run, exact)
             self.filtered = self._advance(run, data)
 
+    def __repr__(self) -> str:
+        proposal = ", ".join(f"{name}: {how}" for name, how in self.proposal.items())
+        return f"Filter({self.engine.known.batch} sequences, {self.steps} steps, {self.count} particles, {proposal})"
+
     def _build(self, run: Rollout, exact: bool) -> None:
         model = self.model
         if not self.endless:

@@ -53,6 +53,11 @@ class WeightPosterior:
     draws: Mapping[str, Tensor]
     sampling: Sampling | None
 
+    def __repr__(self) -> str:
+        count, size = len(next(iter(self.draws.values()))), sum(draws[0].numel() for draws in self.draws.values())
+        models = len(self.ensemble.models)
+        return f"WeightPosterior({count} draws of {size} weights, {models} models, sampling={self.sampling})"
+
 
 class _LogDensity(nn.Module):
     """Log density of all sequences given latents by name, or without latents if the exact evidence is known."""

@@ -532,6 +532,7 @@ def test_a_model_with_a_strided_buffer_resumes(rows, tmp_path):
     stream = model.filter(ZERO, 5, seed=0)
     stream.save(tmp_path / "state")
     resumed = model.filter(resume=tmp_path / "state")
+    assert repr(resumed) == repr(stream) == "Filter(2 sequences, 3 steps, 5 particles, z: guide)"
     torch.testing.assert_close(stream.update(ZERO).log_evidence, resumed.update(ZERO).log_evidence, rtol=0, atol=0)
 
 

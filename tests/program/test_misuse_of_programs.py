@@ -197,6 +197,7 @@ PROGRAMS = [
         "context",
     ),
     (lambda: Oracle(LINEAR, T).evidence(X[:, :3, :1]), "steps"),
+    (lambda: model().filter(dvae.ArrayWindows(X, observed=1)), r"got ArrayWindows, .* `windows.all\(\)`"),
     (floored, "logarithms"),
 ]
 

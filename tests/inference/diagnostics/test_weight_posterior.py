@@ -57,6 +57,7 @@ def test_laplace_is_exact_for_linear_regression(captured):
     torch.testing.assert_close(
         draws.cov(), covariance, rtol=0, atol=4 * covariance.max().item() * math.sqrt(2 / 20_000)
     )
+    assert repr(posterior).startswith("WeightPosterior(20000 draws of 2 weights, 3 models")
     weights = [each.generator["x"].head.out.weight.item() for each in posterior.ensemble.models]
     assert weights == [posterior.draws[NAMES[0]][n].item() for n in (0, 10_000, 19_999)]
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
