@@ -9,6 +9,7 @@ import numpy as np
 
 from .calendar import FEATURES, FLAG, Calendar, functions_of_time
 from .columns import ROUNDED, Column
+from .encoding import EVEN
 from .numerals import is_multiple
 from .panel import Panel, Series
 from .protocol import Cut
@@ -26,6 +27,8 @@ SAME, SAME_CHANGE = 0.999, 0.95
 
 Both are required, since all columns with a trend have similar ranks.
 """
+FEW = 0.1
+"""Share of longer steps below which rows are absent, and above which the steps are uneven by nature."""
 CONTRAST = 10.0
 """Ratio of scales or levels of sequences above which they differ."""
 LONG = 8
@@ -52,6 +55,7 @@ def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
     return [
         *_spikes(columns, values),
         *_split(panel, cut, guessed),
+        *_absent(times),
         *dated,
         *_leaks(*compared),
         *_scales(columns, sequences),
@@ -107,6 +111,17 @@ def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:
             yield f'{reason}; set split = "time" in [cut], with observed and horizon (--split time)'
         elif cut.split == "time" and guessed:
             yield f'the proposed split is by time: {reason}; split = "sequence" tests new sequences instead'
+
+
+def _absent(times: Sequence[np.ndarray]) -> Iterator[str]:
+    """Yield a sentence if few steps are longer than all others, so that rows are absent."""
+    gaps = np.concatenate([np.empty(0), *map(np.diff, times)])
+    is_long = gaps > EVEN * np.median(gaps) if len(gaps) else np.zeros(1, bool)
+    if 0 < is_long.mean() < FEW and gaps[~is_long].max() <= EVEN * gaps.min():
+        yield (
+            f"{is_long.sum()} steps are longer than the others, so the table counts as uneven, and lags and horizons "
+            "count rows; if rows are absent, insert them with empty cells, for example by pandas' asfreq"
+        )
 
 
 def _dated(

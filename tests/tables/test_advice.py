@@ -61,6 +61,15 @@ def test_repeated_values_of_a_continuous_column_are_a_spike():
         Panel([Series("s", np.array([[0.1], [0.3], [-7], [0.25]]))], Columns((Column("x", rounding=0.1),)))
 
 
+def test_absent_rows_are_named():
+    days = np.arange(100)
+    (text,) = found(noise(3, 98, 1), times=DAY * np.delete(days, [20, 50]))
+    assert text.startswith("6 steps are longer than the others")
+    weekdays = days[days % 7 < 5]
+    for times in (weekdays, days**1.1, days[::10], days[:1]):  # uneven by nature, or even
+        assert not found(noise(3, len(times), 1), times=DAY * times)
+
+
 def test_columns_that_reveal_a_target_are_named():
     x = 50 + noise(4, 300, 2).cumsum(1)
     x[:, ::7, 0] = np.nan
