@@ -513,7 +513,7 @@ class Evaluation(Result):
                 f"skill: 1 - {self.headline} / {self.headline} of {self.best_reference}, the best reference row"
             )
         lines += [*(self.verdicts if {"skill", self.headline} & shown else ()), *notes]
-        return "\n".join([*lines, f"not in this table: {', '.join(omitted)}"] if omitted else lines)
+        return "\n".join([*lines, f"not in this table: {'; '.join(omitted)}"] if omitted else lines)
 
     def _title(self) -> str:
         name = str(self.protocol.get("name", ""))

@@ -102,5 +102,5 @@ def test_a_table_of_many_methods_has_five_scores_and_names_the_others():
     }
     wide = replace(result, rows=rows, metrics=dict.fromkeys(names, Metric()))
     assert len(wide.table().columns) == 6
-    assert "not in this table: score 3, score 4, score 5" in str(wide)
+    assert "not in this table: score 3; score 4; score 5" in str(wide)
     assert len(wide.table([*wide.scores]).columns) == 9
