@@ -11,7 +11,6 @@ linear-Gaussian model. Otherwise NUTS draws the latents of all sequences jointly
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -64,11 +63,14 @@ class _LogDensity(nn.Module):
 
     def __init__(self, model: DynamicalVAE, data: Batch):
         super().__init__()
-        self.model, self.data, self.has_evidence = model, data, False
+        self.model, self.data, self.has_evidence, self.obstacle = model, data, False, ""
         if model.latents and not model.wide:
-            with suppress(ValueError), torch.no_grad():  # not linear-Gaussian, or with context
-                self._evidence()
+            try:
+                with torch.no_grad():
+                    self._evidence()
                 self.has_evidence = True
+            except ValueError as error:  # not linear-Gaussian, or with context
+                self.obstacle = f" ({error})"
         self.sampled = () if self.has_evidence else model.latents
 
     def _evidence(self) -> Tensor:
@@ -137,7 +139,7 @@ def weight_posterior(
         density = _LogDensity(copy, data)
         weights = {f"generator.{n}": p.detach() for n, p in copy.generator.named_parameters() if p.requires_grad}
         latents = {name: value.detach() for name, value in copy.guide(data).items()} if density.sampled else {}
-        _require_supported(copy, data, method, weights, latents)
+        _require_supported(copy, data, method, weights, latents, density.obstacle)
         template = {name: value[None] for name, value in (weights | latents).items()}
 
         def energy(flat: Tensor) -> Tensor:
@@ -164,12 +166,16 @@ def weight_posterior(
     return WeightPosterior(Ensemble(members_of), values, sampling)
 
 
-def _require_supported(model: DynamicalVAE, data: Batch, method: str, weights: Values, latents: Values) -> None:
+def _require_supported(
+    model: DynamicalVAE, data: Batch, method: str, weights: Values, latents: Values, obstacle: str
+) -> None:
     if model.grouped and data.group is not None:
         raise ValueError("sequences of a group have one joint density; remove 'group' from the batch")
     if latents and method == "laplace":
         names = ", ".join(latents)
-        raise ValueError(f"'laplace' needs the exact evidence, but {names} can only be sampled; use method='nuts'")
+        raise ValueError(
+            f"'laplace' needs the exact evidence, but {names} can only be sampled{obstacle}; use method='nuts'"
+        )
     if latents:
         require_real(model)
         if data.lengths is not None:

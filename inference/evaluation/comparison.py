@@ -240,8 +240,9 @@ class Comparison(Result):
         return dataclasses.replace(self, rows=rows, mixtures=mixtures)
 
     def table(self) -> Group:
-        """Return three tables: bounds in the order of the ranking, use of the latents, free-running scores."""
-        tables = [self._bound_table(), self._latent_table()]
+        """Return tables: bounds in the order of the ranking; if any, use of latents and free-running scores."""
+        tables = [self._bound_table()]
+        tables += [self._latent_table()] if any(row.latents for row in self.rows.values()) else []
         return Group(*tables, *([self._free_running_table()] if self.samples else []))
 
     @styled

@@ -88,6 +88,14 @@ def test_forecasts_of_the_mixture_are_scored_like_those_of_a_model():
     assert result["mixture"]["CRPS"].mean != result["seeds"]["CRPS"].mean
 
 
+def test_without_latents_no_table_of_latents_is_printed():
+    models = {"observed": DynamicalVAE("p(x_t | x_{t-1})", "", {"x": 1}).double()}
+    models["latent"] = linear_gaussian_surrogate("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 1}, 3)
+    for names, count in (("observed",), 0), (("observed", "latent"), 1):
+        result = compare({name: models[name] for name in names}, torch.randn(4, 3, 1, dtype=torch.float64), **QUIET)
+        assert str(result).count("latents under the guide") == count
+
+
 def test_models_that_differ_in_more_than_weights_are_refused():
     with pytest.raises(ValueError, match="at least one model in an ensemble"):
         Ensemble([])
