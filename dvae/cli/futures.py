@@ -70,6 +70,7 @@ def forecast(
     failed: Expert[Failed] = False,
     figure: Path | None = None,
     beyond: bool = False,
+    blend: int = 0,
 ) -> None:
     """Forecast the test windows, or those of one clip or sequence, many times each.
 
@@ -79,7 +80,8 @@ def forecast(
     For motion, an npz contains, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
     (windows, frames, joints, 3). Missing joints are NaN. It also contains `split`, `clip` and `start` of each window,
     the skeleton, and `emission`, which is "drawn" or "mean". `dvae animate` plays it, and `dvae.motion.Forecasts.load`
-    reads it. A .bvh file contains the first future of the window that moves most. A name without a suffix is a new
+    reads it. `steps` are the largest distances of a joint from the last observed frame to the next one, in futures and
+    in the truth, and `blend` is the number of blended frames. A .bvh file contains the first future of the window that moves most. A name without a suffix is a new
     folder with a BVH file for every window and future. BVH files contain the observed frames and then the future, at
     the place of the clip if the protocol keeps the root's path.
 
@@ -99,13 +101,17 @@ def forecast(
         data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         figure: save a figure of the first window's futures.
         beyond: for a table: forecast the steps after its last row with a target, using covariates of later rows.
+        blend: for motion: number of first frames that pass from the observed motion to the future, so that no joint
+            jumps. Do not score blended forecasts.
     """
+    at_least(0, blend=blend)
     at_least(1, samples=samples, horizon=horizon)
     at_least(0, window=along.window)
     check_files(out, figure)
     loaded, data_set = forecaster(run, data, missing, failed)
     if loaded.config.kind == "panel":
         of_motion = {"fix": bool(fix), "missing": missing, "draw-emission": draw_emission is not None}
+        of_motion["blend"] = blend > 0
         of_motion |= {name: value != getattr(Paths, name) for name, value in vars(along).items()}
         if inapplicable := [name for name, is_given in of_motion.items() if is_given]:
             raise UsageError(f"--{inapplicable[0]} is for motion, and {run} was fitted on a table; leave it out")
@@ -116,8 +122,10 @@ def forecast(
     windows, samples = windows_of(data_set, clip), samples or SAMPLES
     if along != Paths():
         check_files(out, figure, ".npz")
-        if horizon or fix or draw_emission is not None:
-            raise UsageError("--horizon, --fix and --draw-emission do not apply to motion along --joints or --paths")
+        if horizon or fix or draw_emission is not None or blend:
+            raise UsageError(
+                "--horizon, --fix, --draw-emission and --blend do not apply to motion along --joints or --paths"
+            )
         _follow_paths(loaded, windows, along, samples, seed, out, figure)
         return
     suffix = out.suffix.lower()
@@ -129,10 +137,11 @@ def forecast(
         draw_emission = loaded.model.is_drawn()
     futures = draw_futures(loaded, windows, selected, samples, seed, horizon, fix, draw_emission)
     context, protocol = "", windows.protocol
+    blended = futures.blended(blend) if blend else futures
+    written, unblended = (each.window(0, 1) if suffix == ".bvh" else each for each in (blended, futures))
     if suffix == ".npz":
-        futures.save(out)
+        written.save(out)
     else:
-        written = futures.window(0, 1) if suffix else futures
         motion.write_motion(
             out, (written if protocol.root == "drop" else _in_world(written, windows, selected)).motion(), "bvh"
         )
@@ -144,7 +153,28 @@ def forecast(
         f"wrote {out}: {description} of {frames} frames for each of {len(selected)} windows{context}, "
         f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
     )
-    _save_futures(futures, figure)
+    step, true_step = (1000 * each for each in written.steps)
+    before = f" ({1000 * unblended.steps[0]:.0f} mm before blending)" if blend else ""
+    ERROR.print(
+        f"largest step of a joint into the future: {step:.0f} mm{before}, in the true motion {true_step:.0f} mm"
+    )
+    if protocol.root != "drop":
+        ERROR.print(_travel(written))
+    _save_futures(blended, figure)
+
+
+def _travel(futures: motion.Forecasts) -> str:
+    """Return how far and how fast the root moves over the ground in futures, and in the true motion."""
+    skeleton, frames = futures.skeleton, futures.truth.shape[1]
+    level, descriptions = [axis for axis in range(3) if axis != skeleton.vertical], []
+    for future in (futures.forecasts[:, :, :frames], futures.truth[None]):
+        last = np.broadcast_to(futures.observed[:, -1:], (len(future), *futures.observed[:, -1:].shape))
+        path = np.concatenate([last, future], 2)[..., skeleton.root, level]
+        distance = np.nanmean(np.linalg.norm(path[:, :, -1] - path[:, :, 0], axis=-1))
+        speed = skeleton.fps * np.nanmean(np.linalg.norm(np.diff(path, axis=2), axis=-1))
+        descriptions.append(f"{distance:.2f} m at {speed:.2f} m/s")
+    future, true = descriptions
+    return f"the root travels {future}, in the true motion {true} (means over {frames} frames)"
 
 
 def _follow_paths(

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import pi
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from .. import files
 from .data.clips import Clip, MotionSet
 from .files.archive import holds, write_arrays
 from .files.arrays import read_arrays
-from .geometry.skeleton import FIELDS, Skeleton
+from .geometry.skeleton import FIELDS, Skeleton, inverse_lengths
 
 
 def is_forecasts(path: str | Path) -> bool:
@@ -36,6 +38,8 @@ class Forecasts:
         truth: (N, F, J, 3), true frames after the observed ones, NaN where a joint was missing; F is at most H.
         emission: "drawn" if futures include the noise of the emission, "mean" if they are its means given draws of the
             latents, "" if unknown.
+        blend: number of first frames that `blended` changed; 0 if these are the model's own forecasts. Scores are for
+            the model's own forecasts.
 
     Raises:
         ValueError: the shapes do not match each other or the skeleton, or an array is empty.
@@ -49,6 +53,7 @@ class Forecasts:
     observed: np.ndarray
     truth: np.ndarray
     emission: str = ""
+    blend: int = 0
 
     def __post_init__(self) -> None:
         windows, joint = len(self.keys), (self.skeleton.joints, 3)
@@ -78,8 +83,52 @@ class Forecasts:
             samples: number of futures to keep; None for all.
         """
         row = slice(n, n + 1)
-        future = self.forecasts[:samples, row]
-        return Forecasts(self.skeleton, self.keys[row], future, self.observed[row], self.truth[row], self.emission)
+        arrays = {"forecasts": self.forecasts[:samples, row], "observed": self.observed[row], "truth": self.truth[row]}
+        return replace(self, keys=self.keys[row], **arrays)
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Largest distance in metres of a joint from the last observed frame to the next one, of futures and of truth.
+
+        NaN if no such joint was observed.
+        """
+        futures = self.forecasts[:, :, 0], self.truth[:, :1].swapaxes(0, 1)
+        distances = [np.linalg.norm(each - self.observed[:, -1], axis=-1) for each in futures]
+        largest = [float(np.nanmax(each, initial=-1)) for each in distances]
+        first, true = (np.nan if each < 0 else each for each in largest)
+        return first, true
+
+    def blended(self, frames: int) -> Forecasts:
+        """Return futures whose first frames continue the observed motion, without a jump of any joint.
+
+        The first frame becomes the one that the last two observed frames predict at constant velocity. The difference
+        is added to the following frames with weights that fall from 1 to 0 along a cosine. Directions of bones and the
+        position of the root are blended, and lengths of bones change gradually from the observed ones to the future's.
+        A joint that was missing in the last observed frames starts as in the future.
+
+        Args:
+            frames: number of first frames to change.
+
+        Raises:
+            ValueError: the number is not between 1 and the number of frames, or the futures are blended already.
+        """
+        if self.blend or not 1 <= frames <= self.forecasts.shape[2]:
+            raise ValueError(
+                f"cannot blend {frames} frames: expected 1 to {self.forecasts.shape[2]} frames, of forecasts that are "
+                f"not blended yet (these have {self.blend} blended frames)"
+            )
+        skeleton, future = self.skeleton, torch.from_numpy(self.forecasts[:, :, :frames]).double()
+        last, before = (torch.from_numpy(self.observed[:, n]).double() for n in (-1, max(-2, -self.observed.shape[1])))
+        last, expected = (torch.where(x.isfinite(), x, future[:, :, 0])[:, :, None] for x in (last, 2 * last - before))
+        weight = (0.5 + 0.5 * torch.cos(pi / frames * torch.arange(frames, dtype=torch.float64)))[:, None, None]
+        limbs, past_limbs, expected_limbs = (skeleton.limbs(x.flatten(-2)) for x in (future, last, expected))
+        lengths = [x.norm(dim=-1, keepdim=True) for x in (limbs, past_limbs)]
+        root = (future + weight * (expected - future[:, :, :1]))[..., skeleton.root, :]
+        limbs = limbs + weight * (expected_limbs - limbs[:, :, :1])
+        limbs = limbs * inverse_lengths(limbs)[..., None] * torch.lerp(*lengths, weight)
+        joints = skeleton.with_root(skeleton.ends(limbs).unflatten(-1, (-1, 3))) + root[..., None, :]
+        joints = np.concatenate([joints.numpy().astype(self.forecasts.dtype), self.forecasts[:, :, frames:]], 2)
+        return replace(self, forecasts=joints, blend=frames)
 
     def motion(self) -> MotionSet:
         """Return one clip per future, including its observed frames.
@@ -102,14 +151,15 @@ class Forecasts:
     def save(self, path: str | Path) -> None:
         """Write an npz of plain arrays.
 
-        Its members are `forecasts`, `observed` and `truth`; `emission` if known; and `split`, `clip` and `start` of
-        each window. The skeleton has the fields of its JSON file: `name`, `joint_names`, `parents`, `joints_left`,
-        `joints_right`, `up_axis`, `fps`.
+        Its members are `forecasts`, `observed` and `truth`; `emission` if known; `blend`; `steps`; and `split`, `clip`
+        and `start` of each window. The skeleton has the fields of its JSON file: `name`, `joint_names`, `parents`,
+        `joints_left`, `joints_right`, `up_axis`, `fps`.
 
         Args:
             path: path of the file.
         """
         arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
+        arrays |= {"blend": np.array(self.blend), "steps": np.array(self.steps)}
         _write(path, arrays, self.keys, self.skeleton, self.emission)
 
     @classmethod
@@ -135,7 +185,8 @@ class Forecasts:
             motions = [arrays[name] for name in ("forecasts", "observed", "truth")]
             if any(array.dtype.kind != "f" for array in motions):
                 raise ValueError("expected real numbers in forecasts, observed and truth")
-            return cls(skeleton, keys, motions[0], motions[1], motions[2], str(arrays.get("emission", "")))
+            emission, blend = str(arrays.get("emission", "")), int(arrays.get("blend", 0))
+            return cls(skeleton, keys, *motions, emission, blend)
         except KeyError as error:
             raise ValueError(f"{path} has no member {error}; write it with `dvae forecast`") from error
         except (FloatingPointError, TypeError, ValueError) as error:

@@ -101,7 +101,7 @@ def scores(
             f"scores of motion need windows of dvae.motion, which have a skeleton, not {type(windows).__name__}; for "
             "errors in metres only, use dvae.motion.displacements"
         )
-    moves = windows.protocol.root == "relative"
+    moves = windows.protocol.root != "drop"
     measures = displacements(windows, _body(windows.skeleton) if moves else lambda x: x)
     if moves:
         measures += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
@@ -343,7 +343,7 @@ def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
         label, labels = "", [""] * len(windows)
     names = sorted(set(labels))
     classes = torch.tensor([names.index(label_of_window) for label_of_window in labels])
-    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+    body = _body(windows.skeleton) if windows.protocol.root != "drop" else lambda x: x
 
     def moved(x: Tensor) -> Tensor:
         """Return mean steps of the joints, (B, ..., T - 1), of frames (B, ..., T, D)."""
@@ -368,7 +368,7 @@ def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
 
 def _jerk(windows: Windows | ExchangedWindows) -> Measure:
     """Return the jerk, including the transition from the observed frames."""
-    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+    body = _body(windows.skeleton) if windows.protocol.root != "drop" else lambda x: x
     start = max(windows.protocol.observed - SEAM, 0)
 
     def jerk(x: Tensor) -> Tensor:
