@@ -80,10 +80,12 @@ def forecast(
     For motion, an npz contains, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
     (windows, frames, joints, 3). Missing joints are NaN. It also contains `split`, `clip` and `start` of each window,
     the skeleton, and `emission`, which is "drawn" or "mean". `dvae animate` plays it, and `dvae.motion.Forecasts.load`
-    reads it. `steps` are the largest distances of a joint from the last observed frame to the next one, in futures and
-    in the truth, and `blend` is the number of blended frames. A .bvh file contains the first future of the window that moves most. A name without a suffix is a new
-    folder with a BVH file for every window and future. BVH files contain the observed frames and then the future, at
-    the place of the clip if the protocol keeps the root's path.
+    reads it. `largest_steps` are the largest distances of a joint from the last observed frame to the next one, in
+    futures and in the truth, and `blend` is the number of blended frames.
+
+    A .bvh file contains the first future of the window that moves most. A name without a suffix is a new folder with a
+    BVH file for every window and future. BVH files contain the observed frames and then the future, at the place of the
+    clip if the protocol keeps the root's path (`dvae fit --root travel`).
 
     With --joints or --paths, motions start at the first pose of one window and follow these paths.
 
@@ -153,14 +155,19 @@ def forecast(
         f"wrote {out}: {description} of {frames} frames for each of {len(selected)} windows{context}, "
         f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
     )
-    step, true_step = (1000 * each for each in written.steps)
-    before = f" ({1000 * unblended.steps[0]:.0f} mm before blending)" if blend else ""
-    ERROR.print(
-        f"largest step of a joint into the future: {step:.0f} mm{before}, in the true motion {true_step:.0f} mm"
-    )
+    ERROR.print(f"largest step of a joint to the first future frame: {_steps(written, unblended, 1)}")
+    if blend > 1:
+        ERROR.print(f"largest step of a joint in {blend} blended frames: {_steps(written, unblended, blend)}")
     if protocol.root != "drop":
         ERROR.print(_travel(written))
     _save_futures(blended, figure)
+
+
+def _steps(futures: motion.Forecasts, unblended: motion.Forecasts, frames: int) -> str:
+    """Return the largest step of a joint in the first frames, before and after blending, and in the true motion."""
+    (step, true_step), earlier = futures.largest_steps(frames), unblended.largest_steps(frames)[0]
+    note = f" ({1000 * earlier:.0f} mm before blending)" if futures.blend else ""
+    return f"{1000 * step:.0f} mm{note}, in the true motion {1000 * true_step:.0f} mm"
 
 
 def _travel(futures: motion.Forecasts) -> str:

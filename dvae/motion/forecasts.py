@@ -14,7 +14,9 @@ from .. import files
 from .data.clips import Clip, MotionSet
 from .files.archive import holds, write_arrays
 from .files.arrays import read_arrays
-from .geometry.skeleton import FIELDS, Skeleton, inverse_lengths
+from .geometry import kinematics
+from .geometry.rotations import from_matrix, to_matrix
+from .geometry.skeleton import FIELDS, Skeleton
 
 
 def is_forecasts(path: str | Path) -> bool:
@@ -86,25 +88,30 @@ class Forecasts:
         arrays = {"forecasts": self.forecasts[:samples, row], "observed": self.observed[row], "truth": self.truth[row]}
         return replace(self, keys=self.keys[row], **arrays)
 
-    @property
-    def steps(self) -> tuple[float, float]:
-        """Largest distance in metres of a joint from the last observed frame to the next one, of futures and of truth.
+    def largest_steps(self, frames: int = 1) -> tuple[float, float]:
+        """Return the largest distance in metres that a joint moves between frames, in the futures and in the truth.
 
-        NaN if no such joint was observed.
+        Args:
+            frames: number of steps after the last observed frame; the first one is the seam of past and future.
+
+        Returns:
+            The distances, NaN if the joints of no step were observed.
         """
-        futures = self.forecasts[:, :, 0], self.truth[:, :1].swapaxes(0, 1)
-        distances = [np.linalg.norm(each - self.observed[:, -1], axis=-1) for each in futures]
-        largest = [float(np.nanmax(each, initial=-1)) for each in distances]
-        first, true = (np.nan if each < 0 else each for each in largest)
-        return first, true
+        future, true = (
+            np.linalg.norm(np.diff(np.insert(each[:, :, :frames], 0, self.observed[:, -1], 2), axis=2), axis=-1)
+            for each in (self.forecasts, self.truth[None])
+        )
+        largest = (float(np.nanmax(distances, initial=-1)) for distances in (future, true))
+        first, second = (np.nan if each < 0 else each for each in largest)
+        return first, second
 
     def blended(self, frames: int) -> Forecasts:
         """Return futures whose first frames continue the observed motion, without a jump of any joint.
 
         The first frame becomes the one that the last two observed frames predict at constant velocity. The difference
-        is added to the following frames with weights that fall from 1 to 0 along a cosine. Directions of bones and the
-        position of the root are blended, and lengths of bones change gradually from the observed ones to the future's.
-        A joint that was missing in the last observed frames starts as in the future.
+        to the future, a displacement of the root and a rotation of each bone, is applied to the following frames too,
+        with weights that fall from 1 to 0 along a cosine. Lengths of bones change gradually from the observed ones to
+        those of the future. A joint that was missing in the last two observed frames starts as in the future.
 
         Args:
             frames: number of first frames to change.
@@ -122,10 +129,12 @@ class Forecasts:
         last, expected = (torch.where(x.isfinite(), x, future[:, :, 0])[:, :, None] for x in (last, 2 * last - before))
         weight = (0.5 + 0.5 * torch.cos(pi / frames * torch.arange(frames, dtype=torch.float64)))[:, None, None]
         limbs, past_limbs, expected_limbs = (skeleton.limbs(x.flatten(-2)) for x in (future, last, expected))
-        lengths = [x.norm(dim=-1, keepdim=True) for x in (limbs, past_limbs)]
+        first, towards = (torch.nn.functional.normalize(x, dim=-1) for x in (limbs[:, :, :1], expected_limbs))
+        turn = from_matrix(kinematics.swing(first, towards), "vector")
+        lengths = torch.lerp(limbs.norm(dim=-1), past_limbs.norm(dim=-1), weight[..., 0])
+        limbs = (to_matrix(weight * turn, "vector") @ torch.nn.functional.normalize(limbs, dim=-1)[..., None])[..., 0]
+        limbs = lengths[..., None] * limbs
         root = (future + weight * (expected - future[:, :, :1]))[..., skeleton.root, :]
-        limbs = limbs + weight * (expected_limbs - limbs[:, :, :1])
-        limbs = limbs * inverse_lengths(limbs)[..., None] * torch.lerp(*lengths, weight)
         joints = skeleton.with_root(skeleton.ends(limbs).unflatten(-1, (-1, 3))) + root[..., None, :]
         joints = np.concatenate([joints.numpy().astype(self.forecasts.dtype), self.forecasts[:, :, frames:]], 2)
         return replace(self, forecasts=joints, blend=frames)
@@ -151,15 +160,15 @@ class Forecasts:
     def save(self, path: str | Path) -> None:
         """Write an npz of plain arrays.
 
-        Its members are `forecasts`, `observed` and `truth`; `emission` if known; `blend`; `steps`; and `split`, `clip`
-        and `start` of each window. The skeleton has the fields of its JSON file: `name`, `joint_names`, `parents`,
-        `joints_left`, `joints_right`, `up_axis`, `fps`.
+        Its members are `forecasts`, `observed` and `truth`; `emission` if known; `blend`; `largest_steps` after the
+        last observed frame; and `split`, `clip` and `start` of each window. The skeleton has the fields of its JSON
+        file: `name`, `joint_names`, `parents`, `joints_left`, `joints_right`, `up_axis`, `fps`.
 
         Args:
             path: path of the file.
         """
         arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
-        arrays |= {"blend": np.array(self.blend), "steps": np.array(self.steps)}
+        arrays |= {"blend": np.array(self.blend), "largest_steps": np.array(self.largest_steps())}
         _write(path, arrays, self.keys, self.skeleton, self.emission)
 
     @classmethod

@@ -166,7 +166,7 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
         ((first, _), first_name), ((other, _), other_name), *_ = units.items()
         raise ValueError(
             f"{first_name} seems to be in {first}, {other_name} in {other}; if all have the same unit, pass its length "
-            "in metres (`metres`)"
+            "in metres (`metres`); otherwise give the unit of each (`dvae data convert --units FILE=UNIT`)"
         )
     axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
     return World(*next(iter(units)), axis, upwards)

@@ -22,7 +22,7 @@ HEADING = "heading"
 LENGTHS = "bone_lengths"
 """Name in batches of the bone lengths (B, J - 1) of windows, in metres, in the order of `Skeleton.edges`."""
 START = "travel_start"
-"""Name in batches of the root one frame before x, (B, 4): position in metres with the height of frame 0, and heading."""
+"""Name in batches of the root one frame before x, (B, 4): position with the height of frame 0, and heading."""
 ROTATIONS = "rotations"
 """Name in `Batch.view_inputs` of the rotations (B, T, 4 J) of all joints, as concatenated quaternions w x y z."""
 
