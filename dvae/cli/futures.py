@@ -172,14 +172,15 @@ def _steps(futures: motion.Forecasts, unblended: motion.Forecasts, frames: int) 
 
 def _travel(futures: motion.Forecasts) -> str:
     """Return how far and how fast the root moves over the ground in futures, and in the true motion."""
-    skeleton, frames = futures.skeleton, futures.truth.shape[1]
-    level, descriptions = [axis for axis in range(3) if axis != skeleton.vertical], []
-    for future in (futures.forecasts[:, :, :frames], futures.truth[None]):
-        last = np.broadcast_to(futures.observed[:, -1:], (len(future), *futures.observed[:, -1:].shape))
-        path = np.concatenate([last, future], 2)[..., skeleton.root, level]
-        distance = np.nanmean(np.linalg.norm(path[:, :, -1] - path[:, :, 0], axis=-1))
-        speed = skeleton.fps * np.nanmean(np.linalg.norm(np.diff(path, axis=2), axis=-1))
-        descriptions.append(f"{distance:.2f} m at {speed:.2f} m/s")
+    skeleton, frames, descriptions = futures.skeleton, futures.truth.shape[1], []
+    level = [axis for axis in range(3) if axis != skeleton.vertical]
+    for frames_after in (futures.forecasts[:, :, :frames], futures.truth[None]):
+        path = np.insert(frames_after, 0, futures.observed[:, -1], 2)[..., skeleton.root, level]
+        path = path[np.isfinite(path).all((2, 3))]
+        distance = np.linalg.norm(path[:, -1] - path[:, 0], axis=-1)
+        speed = skeleton.fps * np.linalg.norm(np.diff(path, axis=1), axis=-1)
+        means = (each.mean() if len(path) else np.nan for each in (distance, speed))
+        descriptions.append("{:.2f} m at {:.2f} m/s".format(*means))
     future, true = descriptions
     return f"the root travels {future}, in the true motion {true} (means over {frames} frames)"
 

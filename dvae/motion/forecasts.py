@@ -85,8 +85,8 @@ class Forecasts:
             samples: number of futures to keep; None for all.
         """
         row = slice(n, n + 1)
-        arrays = {"forecasts": self.forecasts[:samples, row], "observed": self.observed[row], "truth": self.truth[row]}
-        return replace(self, keys=self.keys[row], **arrays)
+        future, keys = self.forecasts[:samples, row], self.keys[row]
+        return replace(self, keys=keys, forecasts=future, observed=self.observed[row], truth=self.truth[row])
 
     def largest_steps(self, frames: int = 1) -> tuple[float, float]:
         """Return the largest distance in metres that a joint moves between frames, in the futures and in the truth.
@@ -136,8 +136,8 @@ class Forecasts:
         limbs = lengths[..., None] * limbs
         root = (future + weight * (expected - future[:, :, :1]))[..., skeleton.root, :]
         joints = skeleton.with_root(skeleton.ends(limbs).unflatten(-1, (-1, 3))) + root[..., None, :]
-        joints = np.concatenate([joints.numpy().astype(self.forecasts.dtype), self.forecasts[:, :, frames:]], 2)
-        return replace(self, forecasts=joints, blend=frames)
+        changed = joints.numpy().astype(self.forecasts.dtype)
+        return replace(self, forecasts=np.concatenate([changed, self.forecasts[:, :, frames:]], 2), blend=frames)
 
     def motion(self) -> MotionSet:
         """Return one clip per future, including its observed frames.
@@ -195,7 +195,7 @@ class Forecasts:
             if any(array.dtype.kind != "f" for array in motions):
                 raise ValueError("expected real numbers in forecasts, observed and truth")
             emission, blend = str(arrays.get("emission", "")), int(arrays.get("blend", 0))
-            return cls(skeleton, keys, *motions, emission, blend)
+            return cls(skeleton, keys, motions[0], motions[1], motions[2], emission, blend)
         except KeyError as error:
             raise ValueError(f"{path} has no member {error}; write it with `dvae forecast`") from error
         except (FloatingPointError, TypeError, ValueError) as error:

@@ -127,8 +127,8 @@ class MotionData:
         if isinstance(protocol, str):
             protocol = named_protocol(protocol)
         protocol = protocol or default_protocol(clips)
-        changes = {"representation": representation or protocol.representation, "root": root or protocol.root}
-        protocol = replace(protocol, **changes)
+        representation = representation or protocol.representation
+        protocol = replace(protocol, representation=representation, root=root or protocol.root)
         split = apply_splits(clips, protocol)
         tested = {clip.name for clip in split if clip.split == "test"}
         partly = len(split) > len(clips) > 1  # otherwise whole clips form the test split

@@ -490,7 +490,8 @@ class Travel(View):
         axes = to_matrix(quaternions[:, :, root], "quaternion").mT
         turned = rotate_about_up(axes, -heading[..., None].to(axes), self.skeleton.up).mT
         quaternions[:, :, root] = continuous(from_matrix(turned, "quaternion"), dim=1)
-        return quaternions.flatten(-2)
+        facing: Tensor = quaternions.flatten(-2)
+        return facing
 
 
 def _alike_siblings(skeleton: Skeleton) -> tuple[int, ...]:

@@ -3,10 +3,10 @@
 Motion papers compare K futures with the true one in metres (`displacements`; definitions in
 `dvae.motion.scoring.metrics`). Their futures are means of the emission. Forecasts are therefore means by default
 (`Measure.of_means`), and the table says "mean emission"; `draw_emission=True` adds the noise of the emission. If
-windows include global motion (a protocol with root="relative"), these scores compare poses relative to their own root,
-as in TrajeVAE's evaluation. "global ADE" and "global FDE" compare all joints in world coordinates. If the paths of the
-same joints are given in all windows, "path error" is the mean distance of these joints from their paths, over all K
-futures.
+windows include global motion (a protocol whose root is not "drop"), these scores compare poses relative to their own
+root, as in TrajeVAE's evaluation. "global ADE" and "global FDE" compare all joints in world coordinates. If the paths
+of the same joints are given in all windows, "path error" is the mean distance of these joints from their paths, over
+all K futures.
 
 Two scores compare diversity and motion with their true amounts (BeLFusion: Barquero, Escalera and Palmero 2023,
 arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, averaged over the windows whose

@@ -138,7 +138,7 @@ def test_what_the_view_cannot_see_is_an_error(simulated):
         view(Batch(x=x[..., 3:]))
     with pytest.raises(ValueError, match="at least 2 observed frames, got 1"):
         replace(PROTOCOL, observed=1)
-    with pytest.raises(SchemaError, match="models see the travel of the root and positions of joints.*--root"):
+    with pytest.raises(SchemaError, match=r"models see the travel of the root and positions of joints.*--root"):
         dvae.method("hit-dvae", latent=2).build(data)
     with pytest.raises(ValueError, match="remove `Past`"):
         view.following(Batch({START: torch.zeros(1, 4)}))
