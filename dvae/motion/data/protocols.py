@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, astuple, dataclass, field, replace
 from math import pi
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -217,10 +217,12 @@ class Poses(Schema):
         """
         schema = super().of(data, who)
         if (actual := schema.representation) != representation:
+            form, root = schema.protocol.representation, schema.protocol.root
+            advice = [f"whose representation is {representation} (--representation)"] * (form != representation)
+            advice += ["whose root is not 'travel' (--root)"] * (root == "travel")
             raise SchemaError(
                 f"{who} reads {_describe(representation)}, but under this protocol models see {_describe(actual)}; "
-                f"choose a protocol whose representation is {representation} (--representation)"
-                + ("" if actual in get_args(Representation) else " and whose root is not 'travel' (--root)")
+                f"choose a protocol {' and '.join(advice)}"
             )
         return schema
 

@@ -211,6 +211,14 @@ def test_files_with_their_own_units_are_merged(walkers, tmp_path, capsys):
     assert [clip.key for clip in merged] == [("all", "a"), second.clips[0].key]
     np.testing.assert_allclose(merged.clips[0].positions, first.clips[0].positions, atol=1e-4)
     np.testing.assert_allclose(merged.clips[1].positions, second.clips[0].positions, atol=1e-5)
+    assert "the length of a unit in metres, such as 0.01 for centimetres, got -1" in notes(
+        "--units", f"{paths[1]}=-1", code=1
+    )
+    write_motion(tmp_path / "c.npz", first, "amass")
+    assert main(["data", "convert", paths[0], str(tmp_path / "c.npz"), *command[4:]]) == 1
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"{paths[0]} seems to have the unit centimetres (0.01 m), {tmp_path / 'c.npz'} as the file says" in error
+    assert "--units FILE=0.01" in error
     for option, message in (("c.npz=cm", "c.npz is not among the files"), (f"{paths[0]}=ell", "expected FILE=m")):
         assert message in notes("--units", option, code=2)
 
