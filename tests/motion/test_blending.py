@@ -94,5 +94,8 @@ def test_the_command_blends_only_if_asked(run, tmp_path, capsys):
     np.testing.assert_array_equal(blended.forecasts[:, :, 5:], plain.forecasts[:, :, 5:])
     steps = f"{1000 * blended.largest_steps()[0]:.0f} mm ({1000 * plain.largest_steps()[0]:.0f} mm before blending)"
     assert f"first future frame: {steps}, in the true motion" in notes
+    assert main(["evaluate", str(run), "--forecasts", str(tmp_path / "a.npz")]) == 0
+    assert main(["evaluate", str(run), "--forecasts", str(tmp_path / "b.npz")]) == 2
+    assert "its first 5 steps are blended" in " ".join(capsys.readouterr().err.split())
     assert main([*command, str(tmp_path / "c.npz"), "--blend", "61"]) == 1
     assert "expected 1 to 60 frames" in " ".join(capsys.readouterr().err.split())
