@@ -28,7 +28,7 @@ from ..models.method import LatentMethod
 from ..models.motion.trajectories import TrajectoryMethod
 from ..models.registry import methods, metric_models
 from ..motion.data.dataset import SIMULATED
-from ..motion.data.protocols import Representation, Root
+from ..motion.data.protocols import Representation, RootMotion
 from ..motion.segments.dataset import Segmentation
 from ..options import Amount, Frames, Share
 from ..runs import directory as runs
@@ -178,7 +178,7 @@ class DataOptions(CutOptions):
     data: str = SIMULATED
     protocol: ProtocolName | None = None
     representation: Expert[Representation] = "positions"
-    root: Root | None = None
+    root: RootMotion | None = None
     missing: Missing = False
     cut: Expert[Segmentation] = "gait"
     scaling: Expert[Literal["identity", "deviation"]] = "identity"

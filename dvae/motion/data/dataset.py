@@ -10,7 +10,7 @@ from ...options import check
 from ..files import read_motion
 from ..files.reading import select_joints
 from .clips import MotionSet
-from .protocols import PROTOCOLS, Poses, Protocol, Representation, Root, Windows, named_protocol, windows
+from .protocols import PROTOCOLS, Poses, Protocol, Representation, RootMotion, Windows, named_protocol, windows
 from .simulator import simulate
 
 SIMULATED = "simulated"
@@ -102,7 +102,7 @@ class MotionData:
         skip_bad: bool = False,
         missing: bool = False,
         representation: Representation | None = None,
-        root: Root | None = None,
+        root: RootMotion | None = None,
     ) -> Self:
         """Read a motion file, or simulate motion.
 

@@ -44,7 +44,7 @@ from .clips import Clip, MotionSet
 
 Representation = Literal["positions", "6d", "quaternion", "vector"]
 """Input of the models: positions of joints, or rotations in a form of `dvae.motion.geometry.rotations`."""
-Root = Literal["drop", "relative", "travel"]
+RootMotion = Literal["drop", "relative", "travel"]
 """What windows keep of the root, as in `Protocol`."""
 
 
@@ -85,7 +85,7 @@ class Protocol:
     fps: Annotated[float, Range(0.001, 100_000)]
     train_stride: Frames
     test_stride: Frames
-    root: Root = "drop"
+    root: RootMotion = "drop"
     multimodal_threshold: Amount = 0.5
     split_by: str = "split"
     train: tuple[str, ...] = ("train",)
@@ -253,7 +253,7 @@ class Poses(Schema):
     @property
     @override
     def windows(self) -> Poses:
-        root: Root = "drop" if self.protocol.root == "drop" else "relative"
+        root: RootMotion = "drop" if self.protocol.root == "drop" else "relative"
         protocol = replace(self.protocol, representation="positions", root=root)
         return self.from_data(protocol, replace(self.skeleton, rest=()), self.length)
 
