@@ -14,6 +14,7 @@ import tyro
 
 from .. import files, motion
 from ..inference.evaluation.compare import compare as compare_models
+from ..inference.evaluation.ensemble import Ensemble
 from ..inference.evaluation.evaluate import evaluate as evaluate_models
 from ..inference.evaluation.external import ForecastSamples, read_samples, windows_to_forecast
 from ..inference.evaluation.scores import Scores
@@ -466,6 +467,8 @@ def compare(
     particles: int = 100,
     estimates: Expert[int] = 1,
     filter_particles: Expert[int] = 0,
+    leave_future_out: tuple[int, int] | None = None,
+    ensembles: bool = False,
     contrasts: Expert[int] = 128,
     samples: int = 50,
     forecasts: bool = True,
@@ -487,6 +490,9 @@ def compare(
         particles: number K of particles of the IWAE bound.
         estimates: number of independent estimates of the IWAE bound; `to_arviz` of the result needs at least 25.
         filter_particles: number of particles of the FIVO bound; 0 omits it.
+        leave_future_out: L and M: also compare the log densities of M steps given all earlier ones, from L observed
+            steps on.
+        ensembles: add a row for the equal-weight mixture of the seeds of each row with several seeds.
         contrasts: number of windows for the mutual information of latents and data; 0 omits it.
         samples: number of forecasts of each window.
         forecasts: also score forecasts, which takes longest.
@@ -511,13 +517,20 @@ def compare(
         )
     windows = loading.windows_to_test(loaded[0], data_set, stride)
     rows = loading.rows(loaded)
+    models: dict[str, Any] = {name: [each.model for each in row] for name, row in rows.items()}
+    if ensembles:
+        several = {name: row for name, row in models.items() if len(row) > 1}
+        if not several:
+            raise UsageError("--ensembles needs runs that differ only in their seed; each row has one seed")
+        models |= {f"{name}, mixture of {len(row)} seeds": Ensemble(row) for name, row in several.items()}
     result = compare_models(
-        {name: [each.model for each in row] for name, row in rows.items()},
+        models,
         windows,
         scores=loading.SCORES[loaded[0].config.kind],
         particles=particles,
         estimates=estimates,
         filter_particles=filter_particles,
+        leave_future_out=leave_future_out,
         contrasts=contrasts,
         samples=samples if forecasts else 0,
         draw_emission=draw_emission,
