@@ -17,13 +17,12 @@ guide then learns alone for a fifth of the run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
-from pyro import poutine
 from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
 
 WINDOWS = 64
 """Maximum number of training windows that `start` reads."""
-PARENTS = "p(z_t | k_t, z_{t-1})"
 
 
 @dataclass(frozen=True)
@@ -118,8 +116,7 @@ class SwitchingLinear:
         """Return the network of a factor p(z_t | k_t, z_{t-1})."""
         if [parent.lags for parent in inputs] != [(0,), (-1,)] or inputs[1].size != size:
             raise ValueError(
-                f"switching dynamics need the parents of {PARENTS}, in this order; got "
-                f"{', '.join(f'{p.name} at {p.relation and p.relation.name}' for p in inputs)}"
+                f"switching dynamics need the parents k_t and z_{{t-1}} of z_t, in this order; got {inputs}"
             )
         return SwitchingNetwork(inputs, size)
 
@@ -212,43 +209,51 @@ def start(model: DynamicalVAE, train: Any, smoothing: int, iterations: int = 15)
         iterations: iterations of expectation maximisation.
     """
     data = model.read(train.sample(WINDOWS, torch.default_generator))
-    states, size = model.sizes["k"], model.sizes["z"]
-    path, valid = principal_path(model, data, size, smoothing)
+    path, valid = principal_path(model, data, smoothing)
     moves = functional.pad(path[:, 1:] - path[:, :-1], (0, 0, 1, 0))
     points = torch.cat([path - moves / 2, moves], -1)[valid]
-    weights = path.new_zeros(*path.shape[:2], states)
-    weights[valid] = functional.one_hot(cluster(points / points.std(0).clamp(min=1e-6), states), states).to(path)
+    weights = path.new_zeros(*path.shape[:2], model.sizes["k"])
+    weights[valid] = cluster(points / points.std(0).clamp(min=1e-6), model.sizes["k"])
     for _ in range(iterations):
         model.generator["z"].network.fit(path, weights)
+        states = functional.one_hot(weights.argmax(-1), weights.shape[-1]).to(path)
+        ascend(model, data, {"z": path, "k": states}, "k", steps=20, rate=0.1)
         run = model.rollout(data)
         run.values["z"] = path
-        fit_transition(model.generator["k"], {**run.known, "k": weights}, weights, run.lengths)
         weights = run.summation.probabilities()["k"] * valid[..., None]
+    ascend(model, data, {"z": path}, WHOLE, steps=300, rate=0.05)
 
-    def loss() -> Tensor:
-        trace = poutine.trace(poutine.condition(model.model, data={"z": path})).get_trace(data)
-        trace.compute_log_prob(lambda name, site: name == WHOLE)
-        return -trace.nodes[WHOLE]["log_prob"].sum() / valid.sum()
 
-    descend(model.generator[WHOLE], loss, steps=300, rate=0.05)
+@torch.enable_grad()
+def ascend(model: DynamicalVAE, data: Batch, latents: Mapping[str, Tensor], name: str, steps: int, rate: float) -> None:
+    """Fit p(name | ...) to its log density, given latents (B, T, D), by Adam."""
+    optimizer = torch.optim.Adam(model.generator[name].parameters(), lr=rate)
+    for _ in range(steps):
+        run = model.rollout(data)
+        run.values.update(latents)
+        optimizer.zero_grad()
+        (-run.distribution(name).log_prob(run.values[name]).mean()).backward()
+        optimizer.step()
+    optimizer.zero_grad()
 
 
 @torch.no_grad()
-def principal_path(model: DynamicalVAE, data: Batch, size: int, smoothing: int) -> tuple[Tensor, Tensor]:
+def principal_path(model: DynamicalVAE, data: Batch, smoothing: int) -> tuple[Tensor, Tensor]:
     """Return the smoothed principal components of the data, with variance 1, and the mask of valid steps.
+
+    If the data have fewer components than z, the others are 0.
 
     Discrete data are transformed by the inverse hyperbolic sine, which is a logarithm for large counts.
 
     Args:
         model: model, whose units of x are those of the components.
         data: batch, as the model reads it.
-        size: D, number of components; if the data have fewer, the others are 0.
         smoothing: number of steps that are averaged.
 
     Returns:
         Path (B, T, D), 0 at padding, and mask (B, T).
     """
-    x = interpolate_missing(data[WHOLE], data.mask())
+    size, x = model.sizes["z"], interpolate_missing(data[WHOLE], data.mask())
     x = model.units[WHOLE](x) if WHOLE in model.units else x
     x = x.asinh() if model.generator[WHOLE].discrete else x
     valid = x.new_ones(x.shape[:2], dtype=torch.bool) if data.lengths is None else valid_steps(data.lengths, x.shape[1])
@@ -262,14 +267,14 @@ def principal_path(model: DynamicalVAE, data: Batch, size: int, smoothing: int) 
 
 
 def cluster(points: Tensor, count: int, tries: int = 10) -> Tensor:
-    """Return the labels (N,) of the best of several k-means clusterings of points (N, D).
+    """Return the one-hot labels (N, K) of the best of several k-means clusterings of points (N, D).
 
     Args:
         points: points (N, D).
-        count: number of clusters.
+        count: K, number of clusters.
         tries: number of random starts.
     """
-    best, labels = torch.inf, torch.zeros(len(points), dtype=torch.long)
+    best, labels = torch.inf, points
     for _ in range(tries):
         centres = points[torch.randint(len(points), (count,))]
         for _ in range(50):
@@ -277,29 +282,8 @@ def cluster(points: Tensor, count: int, tries: int = 10) -> Tensor:
             members = functional.one_hot(nearest, count).to(points)
             centres = (members.mT @ points + 1e-6 * centres) / (members.sum(0) + 1e-6)[:, None]
         if (distortion := float(distances.square().sum())) < best:
-            best, labels = distortion, nearest
+            best, labels = distortion, members
     return labels
-
-
-def fit_transition(conditional: Any, parents: Mapping[str, Tensor], weights: Tensor, lengths: Tensor | None) -> None:
-    """Fit p(k_t | k_{t-1}, ...) to probabilities of the states (B, T, K), which also replace k_{t-1}."""
-
-    def loss() -> Tensor:
-        logits = conditional.distribution(conditional(parents, *weights.shape[:2], lengths)).logits
-        return -(weights * logits).sum() / weights.sum()
-
-    descend(conditional, loss, steps=20, rate=0.1)
-
-
-@torch.enable_grad()
-def descend(module: nn.Module, loss: Callable[[], Tensor], steps: int, rate: float) -> None:
-    """Minimise a function of the parameters of a module by Adam."""
-    optimizer = torch.optim.Adam(module.parameters(), lr=rate)
-    for _ in range(steps):
-        optimizer.zero_grad()
-        loss().backward()
-        optimizer.step()
-    module.zero_grad()
 
 
 @torch.no_grad()
@@ -314,7 +298,7 @@ def draw_flow(
     """Draw the expected moves of z from a grid of points in a plane, coloured by the most probable state.
 
     The state is the most probable one in the long run if z stayed at the point: the largest entry of the stationary
-    distribution of p(k_t | k_{t-1}, z). The arrow is its mean move, A_k z + b_k - z. Lines are draws of z from the
+    distribution of p(k_t | k_{t-1}, z). The arrow is its mean move, A_k z + b_k - z. Dots are draws of z from the
     guide. The other coordinates of z are fixed at their mean.
 
     Args:
@@ -329,34 +313,28 @@ def draw_flow(
     """
     import matplotlib.pyplot as plt
 
-    expected = RSLDS().equations()[0]
-    if model.generative.text != expected.text:
-        raise ValueError(f"a flow needs the model {expected.text} of rslds, but this model is {model.generative.text}")
+    if model.generative.text != RSLDS.generative:
+        raise ValueError(f"a flow needs the model {RSLDS.generative}, but this model is {model.generative.text}")
     size, states = model.sizes["z"], model.sizes["k"]
     if len(set(coordinates)) != 2 or not set(coordinates) <= set(range(size)):
         raise ValueError(f"`coordinates` must be two of the {size} coordinates of z, from 0; got {coordinates}")
-    z = model.guide(batch)["z"]
-    plane = z[..., list(coordinates)]
-    low, high = plane.amin((0, 1)), plane.amax((0, 1))
+    z = model.guide(batch)["z"].flatten(0, 1)
+    plane = z[:, list(coordinates)]
     grid = torch.cartesian_prod(
-        *(torch.linspace(*ends, points) for ends in zip(low.tolist(), high.tolist(), strict=True))
+        *(torch.linspace(low, high, points) for low, high in zip(*plane.aminmax(dim=0), strict=True))
     )
-    at = z.mean((0, 1)).repeat(len(grid), 1)
-    at[:, list(coordinates)] = grid.to(z)
-    previous = functional.one_hot(torch.arange(states)).to(z)
-    pairs = {"k": previous.repeat(len(grid), 1)[:, None], "z": at.repeat_interleave(states, 0)[:, None]}
-    pairs = {name: functional.pad(value, (0, 0, 0, 1)) for name, value in pairs.items()}  # p(k_2 | k_1, z_1)
-    conditional = model.generator["k"]
-    logits = conditional.distribution(conditional(pairs, len(at) * states, 2)).logits[:, 1]
-    chains = logits.double().softmax(-1).unflatten(0, (-1, states))
+    at = z.mean(0).repeat(len(grid), 1)
+    at[:, list(coordinates)] = grid
+    each = torch.eye(states).to(z)
+    inputs = torch.cat([each.expand(len(at), -1, -1), at[:, None].expand(-1, states, -1)], -1)
+    chains = model.generator["k"].head.out(inputs).double().softmax(-1)
     state = torch.linalg.matrix_power(chains, 2**20).mean(1).argmax(-1)
-    moves = model.generator["z"].network.features_at(previous[state], at)[:, :size] - at
-    ax = plt.figure().add_subplot() if ax is None else ax
-    for sequence in plane:
-        ax.plot(*sequence.mT, color="0.8", linewidth=0.5, zorder=0)
+    moves = (model.generator["z"].network.features_at(each[state], at)[:, :size] - at)[:, list(coordinates)]
+    ax = plt.figure(layout="constrained").add_subplot() if ax is None else ax
+    ax.plot(*plane.mT, ".", color="0.8", markersize=1, zorder=0)
     for k in state.unique().tolist():
         rows = state == k
-        ax.quiver(*grid[rows].mT, *moves[rows][:, list(coordinates)].mT, color=f"C{k}", label=f"k = {k}", angles="xy")
+        ax.quiver(*grid[rows].mT, *moves[rows].mT, color=f"C{k}", label=f"k = {k}", angles="xy")
     ax.set(xlabel=f"z, coordinate {coordinates[0]}", ylabel=f"z, coordinate {coordinates[1]}")
-    ax.legend()
+    ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
     return ax
