@@ -253,10 +253,11 @@ def principal_path(model: DynamicalVAE, data: Batch, smoothing: int) -> tuple[Te
     Returns:
         Path (B, T, D), 0 at padding, and mask (B, T).
     """
-    size, x = model.sizes["z"], interpolate_missing(data[WHOLE], data.mask())
+    x, mask, size = data[WHOLE], data.mask(), model.sizes["z"]
+    valid = x.new_ones(x.shape[:2]).bool() if data.lengths is None else valid_steps(data.lengths, x.shape[1])
+    x = interpolate_missing(x, None if mask is None else mask & valid[..., None])
     x = model.units[WHOLE](x) if WHOLE in model.units else x
     x = x.asinh() if model.generator[WHOLE].discrete else x
-    valid = x.new_ones(x.shape[:2], dtype=torch.bool) if data.lengths is None else valid_steps(data.lengths, x.shape[1])
     rows = x[valid] - x[valid].mean(0)
     _, scale, axes = torch.linalg.svd(rows, full_matrices=False)
     path = rows @ axes[:size].mT * (len(rows) ** 0.5 / scale[:size].clamp(min=1e-6))
