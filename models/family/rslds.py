@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 WINDOWS = 64
 """Maximum number of training windows that `start` reads."""
+LEAST_NOISE = 1e-4
+"""Smallest variance of the initial dynamics, for a path of variance 1."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ class SwitchingNetwork(Network):
         previous, following = z[:, :-1].flatten(0, 1), z[:, 1:].flatten(0, 1)
         inputs, prior = functional.pad(previous, (0, 1), value=1.0), torch.eye(size + 1).to(z)
         moves = (following - previous) * count[:, 1:].flatten(0, 1)
-        spread = moves.mT @ moves / count.sum() + 1e-6 * prior[:size, :size]
+        spread = moves.mT @ moves / count.sum()
         for k, weight in enumerate(weights.unbind(-1)):
             initial, later = weight[:, :1], weight[:, 1:].flatten()[:, None]
             weighted = (later * inputs).mT
@@ -191,7 +193,7 @@ class SwitchingNetwork(Network):
                 (following - inputs @ solution, later, spread),
             )
             for i, (rest, w, default) in enumerate(parts):
-                covariance = ((w * rest).mT @ rest + default) / (w.sum() + 1)
+                covariance = ((w * rest).mT @ rest + default) / (w.sum() + 1) + LEAST_NOISE * prior[:size, :size]
                 whitening = torch.linalg.inv(torch.linalg.cholesky(covariance))
                 self.whitening[i, k] = whitening.tril(-1) + whitening.diagonal().log().diag()
 
