@@ -10,9 +10,9 @@ transitions, for which its Gibbs sampler has Pólya-gamma augmentations, are rep
 on the order of the states. Without the recurrence, p(k_t | k_{t-1}), the model is a switching linear dynamical system.
 The states are summed out exactly, and a recurrent guide infers z.
 
-The likelihood has many local maxima, so `start` initialises the model from the data, like the public package ssm: z is
-the smoothed path of the principal components, and its regimes are found by k-means and expectation maximisation. The
-guide then learns alone for a fifth of the run.
+The likelihood has many local maxima, so `start_regimes` initialises the model from the data, like the public package
+ssm. It sets z to the smoothed principal components, and finds their regimes by k-means and expectation maximisation.
+The guide then learns alone for a fifth of the run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ...distributions.triangular import Triangular
 from ...factorization.inversion import guide
 from ...factorization.notation import Factorization
 from ...inference.training.options import Stage
-from ...inference.training.recipe import Recipe
+from ...inference.training.recipe import Recipe, fit_factor
 from ...networks import Dense, Input, Network, NetworkSpec, Recurrent
 from ...networks.loop import valid_steps
 from ...options import Delay, Range, Size
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WINDOWS = 64
-"""Maximum number of training windows that `start` reads."""
+"""Maximum number of training windows that `start_regimes` reads."""
 LEAST_NOISE = 1e-4
 """Smallest variance of the initial dynamics, for a path of variance 1."""
 
@@ -107,7 +107,7 @@ class RSLDS(LatentMethod):
         recipe = super().train(train, validation, steps)
         parts = {("generator.",): steps // 5, (): steps - steps // 5}
         stages = [Stage(count, self.objective(), frozen=frozen) for frozen, count in parts.items() if count]
-        return replace(recipe, stages=stages, prepare=partial(start, train=train, smoothing=self.smoothing))
+        return replace(recipe, stages=stages, prepare=partial(start_regimes, train=train, smoothing=self.smoothing))
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class SwitchingNetwork(Network):
                 self.whitening[i, k] = whitening.tril(-1) + whitening.diagonal().log().diag()
 
 
-def start(model: DynamicalVAE, train: Any, smoothing: int, iterations: int = 15) -> None:
+def start_regimes(model: DynamicalVAE, train: Any, smoothing: int, iterations: int = 15) -> None:
     """Initialise the generative model of `RSLDS` from training windows.
 
     The path is that of the principal components. Its regimes are clusters of positions and moves, which expectation
@@ -219,33 +219,19 @@ def start(model: DynamicalVAE, train: Any, smoothing: int, iterations: int = 15)
     for _ in range(iterations):
         model.generator["z"].network.fit(path, weights)
         states = functional.one_hot(weights.argmax(-1), weights.shape[-1]).to(path)
-        ascend(model, data, {"z": path, "k": states}, "k", steps=20, rate=0.1)
+        fit_factor(model, "k", data, {"z": path, "k": states}, steps=20, learning_rate=0.1)
         run = model.rollout(data)
         run.values["z"] = path
         weights = run.summation.probabilities()["k"] * valid[..., None]
-    ascend(model, data, {"z": path}, WHOLE, steps=300, rate=0.05)
-
-
-@torch.enable_grad()
-def ascend(model: DynamicalVAE, data: Batch, latents: Mapping[str, Tensor], name: str, steps: int, rate: float) -> None:
-    """Fit p(name | ...) to its log density, given latents (B, T, D), by Adam."""
-    optimizer = torch.optim.Adam(model.generator[name].parameters(), lr=rate)
-    for _ in range(steps):
-        run = model.rollout(data)
-        run.values.update(latents)
-        optimizer.zero_grad()
-        (-run.distribution(name).log_prob(run.values[name]).mean()).backward()
-        optimizer.step()
-    optimizer.zero_grad()
+    fit_factor(model, WHOLE, data, {"z": path}, steps=300, learning_rate=0.05)
 
 
 @torch.no_grad()
 def principal_path(model: DynamicalVAE, data: Batch, smoothing: int) -> tuple[Tensor, Tensor]:
     """Return the smoothed principal components of the data, with variance 1, and the mask of valid steps.
 
-    If the data have fewer components than z, the others are 0.
-
-    Discrete data are transformed by the inverse hyperbolic sine, which is a logarithm for large counts.
+    If the data have fewer components than z, the others are 0. Discrete data are transformed by the inverse hyperbolic
+    sine, which is a logarithm for large counts.
 
     Args:
         model: model, whose units of x are those of the components.
@@ -321,7 +307,9 @@ def draw_flow(
     size, states = model.sizes["z"], model.sizes["k"]
     if len(set(coordinates)) != 2 or not set(coordinates) <= set(range(size)):
         raise ValueError(f"`coordinates` must be two of the {size} coordinates of z, from 0; got {coordinates}")
-    z = model.guide(batch)["z"].flatten(0, 1)
+    data = model.read(batch)
+    z = model.guide(data)["z"]
+    z = z.flatten(0, 1) if data.lengths is None else z[valid_steps(data.lengths, z.shape[1])]
     plane = z[:, list(coordinates)]
     grid = torch.cartesian_prod(
         *(torch.linspace(low, high, points) for low, high in zip(*plane.aminmax(dim=0), strict=True))

@@ -1,5 +1,6 @@
 """The density of `rslds` is that of its equations, its bound is a bound, and it finds the states of simulated data."""
 
+import copy
 import itertools
 import math
 from types import SimpleNamespace
@@ -15,7 +16,8 @@ import dvae
 from benchmarks.studies import nascar
 from dvae.data.schema import Schema
 from dvae.distributions import FAMILIES
-from dvae.models.family.rslds import SwitchingLinear, cluster, draw_flow, principal_path, start
+from dvae.inference.training.recipe import fit_factor
+from dvae.models.family.rslds import SwitchingLinear, cluster, draw_flow, principal_path, start_regimes
 from dvae.networks import Dense
 
 
@@ -175,7 +177,7 @@ def test_the_states_of_a_race_track_are_found(race):
 
 def accuracy_after_start(model, batch, states):
     """Return the share of correct states given the path of the initialised model, at valid steps."""
-    start(model, SimpleNamespace(sample=lambda *_: batch), 5)
+    start_regimes(model, SimpleNamespace(sample=lambda *_: batch), 5)
     data = model.read(batch)
     path, valid = principal_path(model, data, 5)
     run = model.rollout(data)
@@ -236,6 +238,16 @@ def test_wrong_uses_are_an_error():
     sizes, networks = {"k": dvae.Discrete(2), "z": 2, "x": 2}, {"p(z)": SwitchingLinear(), "default": Dense()}
     with pytest.raises(ValueError, match="switching dynamics need"):
         dvae.DynamicalVAE(*pair, sizes, networks)
+
+
+def test_a_fitted_factor_gains_density_and_the_others_keep_their_parameters():
+    model, x, z = build(), torch.randn(3, 5, 3).double(), torch.randn(3, 5, 2).double()
+    before, density = copy.deepcopy(model.state_dict()), model.log_joint(x, {"z": z})["x"].sum()
+    fit_factor(model, "x", x, {"z": z}, steps=20, learning_rate=0.05)
+    changed = {name for name, value in model.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed
+    assert all(name.startswith("generator.x.") for name in changed)
+    assert model.log_joint(x, {"z": z})["x"].sum() > density
 
 
 def test_distinct_clusters_are_found():
