@@ -62,7 +62,7 @@ class RSLDS(LatentMethod):
         width: width of the guide's recurrent states.
         hidden: widths of the perceptron after the guide's recurrent networks.
         smoothing: number of steps over which the path of the principal components is averaged before its regimes are
-            sought; about a quarter of the shortest regime.
+            sought. Noisy data need more, and short regimes need less.
     """
 
     name = "rslds"
@@ -188,11 +188,10 @@ class SwitchingNetwork(Network):
             solution = torch.linalg.solve(weighted @ inputs + prior, weighted @ following + prior[:, :size])
             self.transition[k], self.offset[k] = solution[:-1].mT, solution[-1]
             self.first[k] = (initial * z[:, 0]).sum(0) / (initial.sum() + 1)
-            parts = (
-                (z[:, 0] - self.first[k], initial, prior[:size, :size]),
-                (following - inputs @ solution, later, spread),
-            )
-            for i, (rest, w, default) in enumerate(parts):
+            rests = z[:, 0] - self.first[k], following - inputs @ solution
+            for i, (rest, w, default) in enumerate(
+                zip(rests, (initial, later), (prior[:size, :size], spread), strict=True)
+            ):
                 covariance = ((w * rest).mT @ rest + default) / (w.sum() + 1) + LEAST_NOISE * prior[:size, :size]
                 whitening = torch.linalg.inv(torch.linalg.cholesky(covariance))
                 self.whitening[i, k] = whitening.tril(-1) + whitening.diagonal().log().diag()
@@ -277,12 +276,7 @@ def cluster(points: Tensor, count: int, tries: int = 10) -> Tensor:
 
 @torch.no_grad()
 def draw_flow(
-    model: DynamicalVAE,
-    batch: AnyBatch,
-    ax: Axes | None = None,
-    *,
-    coordinates: tuple[int, int] = (0, 1),
-    points: int = 21,
+    model: DynamicalVAE, batch: AnyBatch, ax: Axes | None = None, coordinates: Sequence[int] = (0, 1)
 ) -> Axes:
     """Draw the expected moves of z from a grid of points in a plane, coloured by the most probable state.
 
@@ -295,7 +289,6 @@ def draw_flow(
         batch: sequences (B, T, D), or a batch, whose latents determine the plane.
         ax: axes; a new figure if None.
         coordinates: the two coordinates of z.
-        points: number of points in each direction.
 
     Raises:
         ValueError: if the model has other equations, or z has no such coordinates.
@@ -312,7 +305,7 @@ def draw_flow(
     z = z.flatten(0, 1) if data.lengths is None else z[valid_steps(data.lengths, z.shape[1])]
     plane = z[:, list(coordinates)]
     grid = torch.cartesian_prod(
-        *(torch.linspace(low, high, points) for low, high in zip(*plane.aminmax(dim=0), strict=True))
+        *(torch.linspace(low, high, 21) for low, high in zip(*plane.aminmax(dim=0), strict=True))
     )
     at = z.mean(0).repeat(len(grid), 1)
     at[:, list(coordinates)] = grid
@@ -326,6 +319,6 @@ def draw_flow(
     for k in state.unique().tolist():
         rows = state == k
         ax.quiver(*grid[rows].mT, *moves[rows].mT, color=f"C{k}", label=f"k = {k}", angles="xy")
-    ax.set(xlabel=f"z, coordinate {coordinates[0]}", ylabel=f"z, coordinate {coordinates[1]}")
+    ax.set(**{f"{axis}label": f"z, coordinate {c}" for axis, c in zip("xy", coordinates, strict=True)})
     ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
     return ax

@@ -6,6 +6,7 @@ import math
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
+import nascar
 import numpy as np
 import pytest
 import torch
@@ -13,7 +14,6 @@ from scipy import stats
 from scipy.optimize import linear_sum_assignment
 
 import dvae
-from benchmarks.studies import nascar
 from dvae.data.schema import Schema
 from dvae.distributions import FAMILIES
 from dvae.inference.training.recipe import fit_factor
@@ -138,17 +138,17 @@ def test_the_bounds_of_the_recurrent_model_are_below_the_evidence_by_quadrature(
     with torch.no_grad():
         model.generator["k"].head.out.weight[:, 2:] *= 5
     x = model.sample(2, steps)["x"]
-    line = torch.linspace(-10, 10, 81, dtype=torch.float64)
+    line = torch.linspace(-9, 9, 61, dtype=torch.float64)
     grid = torch.cartesian_prod(line, line, line)[..., None]
     evidence = []
     for sequence in x:
         logs = [log_joint(model, sequence.expand(len(z), -1, -1), z) for z in grid.split(200_000)]
-        evidence.append(np.logaddexp.reduce(np.concatenate(logs)) + 3 * math.log(0.25))
+        evidence.append(np.logaddexp.reduce(np.concatenate(logs)) + 3 * math.log(0.3))
     evidence = torch.tensor(evidence)
-    bounds = torch.stack([dvae.SequenceELBO().terms(model, x).bound.detach() for _ in range(200)])
+    bounds = torch.stack([dvae.SequenceELBO().terms(model, x).bound.detach() for _ in range(50)])
     assert (bounds.mean(0) < evidence).all()
     dvae.fit(model, x, stages=[dvae.Stage(300, frozen=("generator.",))], learning_rate=1e-2, progress=False)
-    torch.testing.assert_close(dvae.iwae_bound(model, x, 20_000).bound, evidence, atol=0.05, rtol=0)
+    torch.testing.assert_close(dvae.iwae_bound(model, x, 10_000).bound, evidence, atol=0.1, rtol=0)
 
 
 def test_dynamics_fitted_to_a_path_without_noise_are_exact():
@@ -175,11 +175,11 @@ def test_the_states_of_a_race_track_are_found(race):
     assert nascar.accuracy(fit.model, x[40:], states[40:]) >= 0.9
 
 
-def accuracy_after_start(model, batch, states):
+def accuracy_after_start(model, batch, states, smoothing=5):
     """Return the share of correct states given the path of the initialised model, at valid steps."""
-    start_regimes(model, SimpleNamespace(sample=lambda *_: batch), 5)
+    start_regimes(model, SimpleNamespace(sample=lambda *_: batch), smoothing)
     data = model.read(batch)
-    path, valid = principal_path(model, data, 5)
+    path, valid = principal_path(model, data, smoothing)
     run = model.rollout(data)
     run.values["z"] = path
     inferred = run.summation.probabilities()["k"].argmax(-1)[valid]
@@ -203,18 +203,19 @@ class Counts(Schema):
 
 
 def test_counts_start_at_the_states():
+    """Counts have more noise, so their path needs more smoothing."""
     torch.manual_seed(0)
-    race = nascar.track().sample(50, 228)
+    race = nascar.track().sample(30, 228)
     counts = torch.poisson((2 * race["z"] @ torch.linalg.qr(torch.randn(40, 2))[0].mT + 1.5).exp())
     model = dvae.method("rslds").build(Counts({"x": 40}))
-    assert accuracy_after_start(model, {"x": counts}, race["k"].argmax(-1)) >= 0.9
+    assert accuracy_after_start(model, {"x": counts}, race["k"].argmax(-1), smoothing=9) >= 0.9
 
 
 def test_the_flow_is_that_of_the_true_parameters(race):
     truth, x, _ = race
     truth.guide = lambda batch: {"z": torch.tensor([[[-3.5, -1.5], [3.5, 1.5]]])}
     try:
-        ax = draw_flow(truth, x, points=5)
+        ax = draw_flow(truth, x)
     finally:
         del truth.guide
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
