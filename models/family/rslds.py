@@ -316,9 +316,9 @@ def draw_flow(
     moves = (model.generator["z"].network.features_at(each[state], at)[:, :size] - at)[:, list(coordinates)]
     ax = plt.figure(layout="constrained").add_subplot() if ax is None else ax
     ax.plot(*plane.mT, ".", color="0.8", markersize=1, zorder=0)
+    ax.quiver(*grid.mT, *moves.mT, color=[f"C{k}" for k in state.tolist()], angles="xy")
     for k in state.unique().tolist():
-        rows = state == k
-        ax.quiver(*grid[rows].mT, *moves[rows].mT, color=f"C{k}", label=f"k = {k}", angles="xy")
+        ax.plot([], [], color=f"C{k}", label=f"k = {k}")
     ax.set(**{f"{axis}label": f"z, coordinate {c}" for axis, c in zip("xy", coordinates, strict=True)})
     ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
     return ax

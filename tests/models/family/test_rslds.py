@@ -10,6 +10,7 @@ import nascar
 import numpy as np
 import pytest
 import torch
+from matplotlib import colors
 from scipy import stats
 from scipy.optimize import linear_sum_assignment
 
@@ -220,13 +221,15 @@ def test_the_flow_is_that_of_the_true_parameters(race):
         del truth.guide
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels == ["k = 0", "k = 1", "k = 2", "k = 3"]
-    dynamics = truth.generator["z"].network
-    for k, arrows in enumerate(ax.collections):
-        places = torch.tensor(np.asarray(arrows.get_offsets()), dtype=torch.float32)
-        inside = [places[:, 0] > 2, places[:, 0] < -2, places[:, 1] >= 0, places[:, 1] < 0][k]
-        assert inside.all()
-        moves = dynamics.features_at(torch.eye(4)[k].expand(len(places), -1), places)[:, :2] - places
-        np.testing.assert_allclose(np.stack([arrows.U, arrows.V], 1), moves.detach(), atol=1e-5)
+    (arrows,) = ax.collections
+    places = torch.tensor(np.asarray(arrows.get_offsets()), dtype=torch.float32)
+    colours = np.stack([colors.to_rgba(f"C{k}") for k in range(4)])
+    states = (arrows.get_facecolors()[:, None] == colours).all(-1).argmax(-1)
+    right, top = places.T
+    logits = torch.stack([100 * (right - 2), -100 * (right + 2), 10 * top, -10 * top], 1)
+    np.testing.assert_array_equal(states, logits.argmax(1))
+    moves = truth.generator["z"].network.features_at(torch.eye(4)[states], places)[:, :2] - places
+    np.testing.assert_allclose(np.stack([arrows.U, arrows.V], 1), moves.detach(), atol=1e-5)
     plt.close(ax.figure)
 
 
