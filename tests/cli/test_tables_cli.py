@@ -268,7 +268,15 @@ def test_runs_are_compared_criticised_resumed_and_swept(table_runs, table, tmp_p
     assert not OF_MOTION.findall(captured.out)
     assert main(["resume", both[0], "--steps", "3"]) == 0
     out = str(tmp_path / "sweep")
-    assert main(["sweep", "autoregressive", "--out", out, "--seeds", "0", "--data", str(table), *SMALL, *OPTIONS]) == 0
+    data = ["--data", str(table), *SMALL, *OPTIONS]
+    assert main(["sweep", "autoregressive", "--out", out, "--seeds", "0", "1", *data]) == 0
+    swept = [f"{out}/autoregressive-seed{seed}" for seed in range(2)]
+    mixed = ["evaluate", *swept, "--ensembles", "--samples", "4", "--out", str(tmp_path / "mixed.json")]
+    assert main(mixed) == 0
+    rows = dvae.Evaluation.load(tmp_path / "mixed.json").rows
+    assert "autoregressive, mixture of 2 seeds" in rows
+    assert {row.samples for name, row in rows.items() if name.startswith("autoregressive")} == {4}
+    assert "needs runs that differ only in their seed" in failure(capsys, "evaluate", *both, "--ensembles", code=2)
     assert dvae.load(tmp_path / "sweep" / "autoregressive-seed0").schema.cut.horizon == 3
     assert "which is of a table" in failure(capsys, "animate", both[0], "--out", tmp_path / "a.html")
 
@@ -298,7 +306,9 @@ def test_options_for_another_kind_of_data_are_errors(people, table_runs, tmp_pat
     for option in ("--observed", "--test"):
         error = failure(capsys, "fit", "vae", *out, option, "0", code=2)
         assert f"{option} is for tables; give the path of a table with --data" in error
-    assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
+    assert "people.npz cannot be read as npz: it holds" in failure(
+        capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2
+    )
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
         assert "is for motion" in failure(capsys, "evaluate", table_runs / "vae", *option, code=2)
     assert "--fix is for motion" in failure(capsys, "forecast", table_runs / "vae", *out, "--fix", "lower", code=2)
