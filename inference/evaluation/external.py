@@ -177,9 +177,14 @@ class ForecastSamples:
                     f"{[*expected][:MOST]!r:.500}"
                 )
         values = tensor_of(self.values)
-        values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
+        is_real = values.is_floating_point()
         order = torch.arange(count) if self.keys is None else self._order(windows.keys, name)
-        return shape[0], lambda part: values[:, order[part]]
+
+        def futures(part: slice) -> Tensor:
+            chosen = values[:, order[part]]
+            return chosen if is_real else chosen.double()  # float32 would round large counts
+
+        return shape[0], futures
 
     def _order(self, keys: Sequence[Key], name: str) -> Tensor:
         """Return the place in these samples of each window of the evaluation."""

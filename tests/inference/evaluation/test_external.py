@@ -139,6 +139,13 @@ def test_forecasts_of_other_types_are_scored_in_the_precision_of_the_truth(own, 
     assert score(rounded, windows)["theirs"]["CRPS"].mean == pytest.approx(expected, rel=1e-6)
 
 
+def test_large_counts_are_not_rounded(own, windows):
+    counts = own[0].mul(10).round().long() + 2**28
+    far = ArrayWindows(windows.x * 10 + 2**28, OBSERVED)
+    expected = score(counts.double(), far)["theirs"]["CRPS"].mean
+    assert score(counts, far)["theirs"]["CRPS"].mean == pytest.approx(expected, rel=1e-6)
+
+
 WRONG = {
     "no window axis": (lambda x, w: x[:, 0], r"shape \(9, 3, 2\), expected samples \(K, N, T, D\) = \(K, 7, 3, 2\)"),
     "missing windows": (lambda x, w: x[:, 1:], r"shape \(9, 6, 3, 2\), expected .* \(K, 7, 3, 2\)"),
