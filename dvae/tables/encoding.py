@@ -208,6 +208,12 @@ class PanelSchema(Schema):
         )
         median = float(np.median(gaps)) if len(gaps) else 0.0
         step = median if len(gaps) and (gaps.max() > EVEN * median or median > EVEN * gaps.min()) else 0.0
+        if step and panel.columns.lags and not (panel.calendar.step or "").endswith("B"):  # weekends are no gaps
+            warnings.warn(
+                f"{panel.name} has uneven steps, and lags count rows: a lag of {panel.columns.lags[0]} rows is not "
+                "always the same time; add the missing rows, with empty targets, if that matters",
+                stacklevel=2,
+            )
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
         windows = _TrainingWindows(training, cut)
         units["priors"] = _estimate_priors(panel.columns, windows)
