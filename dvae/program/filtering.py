@@ -169,7 +169,8 @@ class Prediction:
     def sample(self, samples: int) -> dict[str, Tensor]:
         """Return draws (S, B, D) of each data variable, in the unit of the data.
 
-        Each variable has its marginal distribution: its draws do not depend on those of another one that it reads.
+        Each variable has its marginal distribution: its draws do not depend on those of another variable, or part of x,
+        that it reads at this step.
         """
         require(Count, samples=samples)
         draws, rows = {}, dict[int, Tensor]()
@@ -195,7 +196,7 @@ class Filter:
     """The state of a filter after some steps; `DynamicalVAE.filter` builds it.
 
     Attributes:
-        filtered: results of the steps of the last call.
+        filtered: results of the steps of the last call; there are none after `load`.
         proposal: as in `Filtered`.
     """
 

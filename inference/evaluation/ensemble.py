@@ -22,11 +22,11 @@ class Ensemble(nn.Module):
     Forecasts weigh all models equally. Name the row so that a reader sees that it is a mixture.
 
     Args:
-        models: models with the same equations and sizes.
+        models: models with the same equations and sizes; networks and distributions are not compared.
 
     Raises:
         TypeError: when one of `models` is not a `DynamicalVAE`.
-        ValueError: when there are none, or they differ in more than their weights.
+        ValueError: when there are none, or they differ in equations or sizes.
 
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
