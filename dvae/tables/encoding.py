@@ -255,8 +255,9 @@ class PanelSchema(Schema):
             names = ", ".join(f"{column.name} ({column.family})" for column in self.columns.targets)
             needs = {"logs": "a column of a positive family", "seasonal": "a season (season=7, --season 7)"}
             need = needs.get(target_units, "a column of numbers or counts")
-            advice = "take the units series or changes" if target_units in needs else "take the units columns"
-            raise SchemaError(f"units {target_units!r} need {need}; got {names}; {advice}")
+            others = target_units in needs and any(c.family in UNITS_OF_SERIES for c in self.columns.targets)
+            advice = "series or changes" if others else "columns"
+            raise SchemaError(f"units {target_units!r} need {need}; got {names}; take the units {advice}")
         return schema
 
     @property
