@@ -111,8 +111,8 @@ class ForecastSamples:
                 f"{name!r} must have samples (K, T, D) of each window, with one shape and one order of columns; item 0 "
                 f"has {kinds[0]!r:.300}, and item {other} has {kinds[other]!r:.300}"
             )
-        order = {"sequences": sequences, "starts": starts} if keys is None else {}
-        return cls(torch.stack(values, 1), keys, columns[0], **order)
+        sequences, starts = (sequences, starts) if keys is None else ((), ())
+        return cls(torch.stack(values, 1), keys, columns[0], sequences, starts)
 
     def arranged(self, axes: str) -> ForecastSamples:
         """Return the samples with their axes in the order (K, N, T, D).
