@@ -65,7 +65,7 @@ class Particles:
         self.data_names = self._local(model.observed)
         drawn = {*model.latents, *model.summed, *self.data_names}
         self.instant = {
-            factor.child: {p.name for p in factor.parents if p.name in drawn and _reads_now(p)}
+            factor.child: {p.name for p in factor.parents if p.name in drawn and reads_now(p)}
             for factor in model.generative.factors
         }
         """Variables of the same step that each variable reads."""
@@ -619,5 +619,6 @@ def reads_ahead(parent: Parent, length: int) -> bool:
     return 1 in parent.relation.directions
 
 
-def _reads_now(parent: Parent) -> bool:
+def reads_now(parent: Parent) -> bool:
+    """Return whether a factor reads the same step of a local parent."""
     return parent.relation is not None and 0 in parent.relation.directions
