@@ -30,6 +30,7 @@ METHODS = {
     "rvae-noncausal": "dvae.models.family.rvae:NonCausalRVAE",
     "dsae": "dvae.models.family.dsae:DSAE",
     "kvae": "dvae.models.family.kvae:KVAE",
+    "rslds": "dvae.models.family.rslds:RSLDS",
     "autoregressive": "dvae.models.family.autoregressive:Autoregressive",
     "moglow": "dvae.models.baselines.moglow:MoGlow",
     "moglow-paths": "dvae.models.baselines.moglow_paths:MoGlowPaths",

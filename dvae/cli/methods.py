@@ -76,8 +76,11 @@ def show(
             kind = registry.method(method)
         if _asks_for_equations(kind):
             raise UsageError(f"{method} has no equations of its own; give --generative and --inference")
+        from ..program.enumeration import Discrete  # imports torch
+
         pair = kind.equations()
-        observed = [name for name in pair[0].variables if name not in pair[1].variables]
+        summed = tuple(name for name, size in kind.sizes().items() if isinstance(size, Discrete))
+        observed = [name for name in pair[0].variables if name not in (*pair[1].variables, *summed)]
     elif generative and inference is None:
         with arguments():
             choice = alternatives(generative, summed=summed)

@@ -34,7 +34,16 @@ from ..options import Count, Range, require
 from .batch import AnyBatch
 from .conditional import Conditional, like
 from .gaussian import GaussianFilter, is_linear_gaussian
-from .particles import Particles, effective_size, hidden_data, is_windowed, log_mean, mixture, reads_ahead
+from .particles import (
+    Particles,
+    effective_size,
+    hidden_data,
+    is_windowed,
+    log_mean,
+    moments_of_mixture,
+    reads_ahead,
+    reads_now,
+)
 from .rollout import Rollout
 
 PARTICLES = 100
@@ -147,7 +156,7 @@ class Prediction:
             with suppress(NotImplementedError, AttributeError):  # some distributions have no formula
                 variances = conditional.distribution(parameters).variance
             shape = log_weights.shape
-            moments[name] = mixture(means.unflatten(0, shape), variances.unflatten(0, shape), log_weights)
+            moments[name] = moments_of_mixture(means.unflatten(0, shape), variances.unflatten(0, shape), log_weights)
         return moments
 
     def pit(self, name: str, value: Tensor, uniform: Tensor) -> Tensor:
@@ -167,7 +176,11 @@ class Prediction:
         return below + uniform * (upto - below)
 
     def sample(self, samples: int) -> dict[str, Tensor]:
-        """Return draws (S, B, D) of each data variable, in the unit of the data."""
+        """Return draws (S, B, D) of each data variable, in the unit of the data.
+
+        Each variable has its marginal distribution: its draws do not depend on those of another variable, or part of x,
+        that it reads at this step.
+        """
         require(Count, samples=samples)
         draws, rows = {}, dict[int, Tensor]()
         with torch.no_grad():
@@ -192,7 +205,7 @@ class Filter:
     """The state of a filter after some steps; `DynamicalVAE.filter` builds it.
 
     Attributes:
-        filtered: results of the steps of the last call.
+        filtered: results of the steps of the last call; there are none after `load`.
         proposal: as in `Filtered`.
     """
 
@@ -221,7 +234,13 @@ class Filter:
                 self.proposal = dict.fromkeys(model.latents, "exact")
             self.proposal |= dict.fromkeys(model.summed, "exact")
             self.endless = why_not_endless(model, run, self.proposal)
-            self.count = 1 if exact or not model.latents else particles or PARTICLES
+            # without latents, particles still draw the data that other data of the same step depend on
+            is_drawn = model.latents or any(
+                parent.name in model.observed and reads_now(parent)
+                for factor in model.generative.factors
+                for parent in factor.parents
+            )
+            self.count = 1 if exact or not is_drawn else particles or PARTICLES
             self._build(run, exact)
             self.filtered = self._advance(run, data)
 

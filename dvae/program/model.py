@@ -600,8 +600,8 @@ class DynamicalVAE(nn.Module):
             if batch is None:
                 raise ValueError("filter needs the first steps of the data, or resume= with the file of a filter")
             return Filter(self, batch, particles, lag, resample_below, seed)
-        if batch is not None or particles is not None or seed is not None:
-            raise ValueError("resume= restores a filter with its data and particles; leave out the other arguments")
+        if any(each is not None for each in (batch, particles, seed)) or (lag, resample_below) != (0, 0.5):
+            raise ValueError("resume= restores a filter with all its settings; leave out the other arguments")
         return Filter.load(self, resume)
 
     @torch.no_grad()

@@ -208,6 +208,12 @@ class PanelSchema(Schema):
         )
         median = float(np.median(gaps)) if len(gaps) else 0.0
         step = median if len(gaps) and (gaps.max() > EVEN * median or median > EVEN * gaps.min()) else 0.0
+        if step and panel.columns.lags and not (panel.calendar.step or "").endswith("B"):  # weekends are no gaps
+            warnings.warn(
+                f"{panel.name} has uneven steps, and lags count rows: a lag of {panel.columns.lags[0]} rows is not "
+                "always the same time; add the missing rows, with empty targets, if that matters",
+                stacklevel=2,
+            )
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
         windows = _TrainingWindows(training, cut)
         units["priors"] = _estimate_priors(panel.columns, windows)
@@ -249,8 +255,9 @@ class PanelSchema(Schema):
             names = ", ".join(f"{column.name} ({column.family})" for column in self.columns.targets)
             needs = {"logs": "a column of a positive family", "seasonal": "a season (season=7, --season 7)"}
             need = needs.get(target_units, "a column of numbers or counts")
-            advice = "take the units series or changes" if target_units in needs else "take the units columns"
-            raise SchemaError(f"units {target_units!r} need {need}; got {names}; {advice}")
+            others = target_units in needs and any(c.family in UNITS_OF_SERIES for c in self.columns.targets)
+            advice = "series or changes" if others else "columns"
+            raise SchemaError(f"units {target_units!r} need {need}; got {names}; take the units {advice}")
         return schema
 
     @property

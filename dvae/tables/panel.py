@@ -144,7 +144,10 @@ class Panel:
             for indices in kinds.values():
                 cells, (is_valid, domain) = block[:, indices], _validity_test(self.columns.columns[indices[0]])
                 with np.errstate(invalid="ignore", over="ignore"):
-                    valid = is_valid(cells.astype(np.float32))  # in the precision of models
+                    precise = cells.astype(np.float32)  # as models
+                    valid = is_valid(precise)
+                    if self.columns.columns[indices[0]].family == "hurdle":  # tiny values must not become zeros
+                        valid &= (cells == 0) == (precise == 0)
                 invalid = ~(valid & (np.abs(cells) < LARGEST)) & ~absent[:, indices]
                 if invalid.any():
                     row, offset = np.argwhere(invalid)[0]
@@ -358,7 +361,8 @@ def _validity_test(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], 
         "binary": (lambda v: (v == 0) | (v == 1), "0 or 1"),
         **dict.fromkeys(COUNTS, (_counts, "whole numbers from 0")),
         **dict.fromkeys(("positive", "log-normal"), (lambda v: v > 0, "numbers above 0")),
-        **dict.fromkeys(("hurdle", "power"), (lambda v: v >= 0, "numbers from 0")),
+        "hurdle": (lambda v: v >= 0, "0, or numbers above 0 that float32 resolves"),
+        "power": (lambda v: v >= 0, "numbers from 0"),
         "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
         "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
     }

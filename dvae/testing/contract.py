@@ -296,6 +296,8 @@ class FactorizationContract:
         model = self._model()
         if model.context:
             pytest.skip("the evidence given a context is unknown")
+        if any(parent not in model.summed for name in model.summed for parent in model.generator[name].parents):
+            pytest.skip("the evidence is unknown, because states depend on continuous variables")
         # size 1, because a diagonal covariance is then no restriction
         sizes = {name: size if name in model.summed else 1 for name, size in model.sizes.items()}
         pair = linear_gaussian_surrogate(model.generative, model.inference, sizes, self.steps, observed=model.observed)

@@ -7,7 +7,8 @@ for every t. Here the weights were fitted to other sequences and do not change, 
 log evidences, log p(x_{1:t+M}) - log p(x_{1:t}). The latents are integrated out. The sum telescopes: only the evidences
 of the M first and the M last prefixes remain.
 
-The evidence of a prefix is exact for a linear-Gaussian model, and for a model whose latents are all summed out.
+The evidence of a prefix is exact for a linear-Gaussian model without context whose networks are `networks.Linear`, as
+for `Oracle`, and for a model whose latents are all summed out.
 Otherwise, R independent estimates of it are averaged, each by K particles (`fivo_bound`) or, for a guide that
 particles cannot follow, by K importance weights. The guide reads the prefix alone, so no proposal depends on the
 future. The Monte Carlo standard error is the jackknife's over the R estimates.

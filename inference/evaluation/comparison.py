@@ -501,11 +501,15 @@ class Comparison(Result):
             f"IWAE bound ↑\nK = {self.particles}": lambda name: str(self[name]["IWAE bound"]),
             "difference to the best": lambda name: self._behind(name, best, "IWAE bound"),
         }
+        filters: dict[str, Callable[[str], str]] = {
+            f"FIVO bound ↑\nK = {self.filter_particles}": lambda name: str(self[name].get("FIVO bound", "–"))
+        }
+        filters = filters if self.filter_particles else {}
         if self.leave_future_out:
             observed, horizon = self.leave_future_out
             first = max(self.rows, key=lambda name: self[name]["LFO"].mean)
             few = {name: (row.bounds["LFO particles"] < EFFECTIVE).mean() for name, row in self.rows.items()}
-            columns |= {
+            columns |= filters | {
                 f"LFO ↑\nL = {observed}, M = {horizon}": lambda name: str(self[name]["LFO"]),
                 "difference to\nthe best LFO": lambda name: self._behind(name, first, "LFO"),
                 "unreliable\nIWAE, LFO": lambda name: f"{_percent(self.rows[name].unreliable)}, {_percent(few[name])}",
@@ -521,12 +525,9 @@ class Comparison(Result):
             columns |= {
                 "95 % (df)": lambda name: "–" if name == best else _interval(self.difference(name, best)),
                 "ELBO ↑": lambda name: str(self[name]["ELBO"]),
+                **filters,
+                f"k-hat\n> {KHAT}": lambda name: _percent(self.rows[name].unreliable),
             }
-            if self.filter_particles:
-                columns[f"FIVO bound ↑\nK = {self.filter_particles}"] = lambda name: str(
-                    self[name].get("FIVO bound", "–")
-                )
-            columns[f"k-hat\n> {KHAT}"] = lambda name: _percent(self.rows[name].unreliable)
             lines = [
                 "95 %: confidence interval from both errors (df: degrees of freedom of Student's t)",
                 f"k-hat > {KHAT}: share of {unit}s whose IWAE bound is unreliable",

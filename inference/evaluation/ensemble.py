@@ -22,11 +22,11 @@ class Ensemble(nn.Module):
     Forecasts weigh all models equally. Name the row so that a reader sees that it is a mixture.
 
     Args:
-        models: models with the same equations and sizes.
+        models: models with the same equations and sizes; networks and distributions are not compared.
 
     Raises:
         TypeError: when one of `models` is not a `DynamicalVAE`.
-        ValueError: when there are none, or they differ in more than their weights.
+        ValueError: when there are none, or they differ in equations or sizes.
 
     Example:
         >>> pair = "p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})"
@@ -44,16 +44,15 @@ class Ensemble(nn.Module):
         self.generative, self.inference, self.is_drawn = models[0].generative, models[0].inference, models[0].is_drawn
 
     def forecast(self, batch: Any, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
-        """Return forecasts by name, (K, B, ...), of which each model draws K / S, in random order.
+        """Return independent draws from the mixture by name, (K, B, ...); a random model makes each of the K forecasts.
 
-        If S does not divide K, the models that draw one more are chosen at random.
+        With K / S forecasts of each model, too few pairs would be of one model, and scores of pairs biased (CRPS).
 
         Args:
             batch, horizon, options: as in `DynamicalVAE.forecast`.
             samples: K, number of forecasts of all models together.
         """
-        counts = torch.full((len(self.models),), samples // len(self.models))
-        counts[torch.randperm(len(self.models))[: samples % len(self.models)]] += 1
+        counts = torch.randint(len(self.models), (max(samples, 0),)).bincount(minlength=len(self.models))
         draws = [
             model.forecast(batch, horizon, count, **options)  # type: ignore[operator, union-attr]
             for model, count in zip(self.models, counts.tolist(), strict=True)

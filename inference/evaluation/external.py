@@ -20,6 +20,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
@@ -62,6 +63,7 @@ class ForecastSamples:
             order of the evaluation.
         columns: names of the D columns; empty if unknown.
         sequences: name of the sequence of each window, "" if unknown, to check the order; empty if all are unknown.
+        starts: time of the first step of each future, None if unknown, to check the order; empty if all are unknown.
         emission: "mean" if samples are known to be means of an emission distribution given draws of latents.
     """
 
@@ -69,6 +71,7 @@ class ForecastSamples:
     keys: Sequence[Key] | None = None
     columns: Sequence[str] = ()
     sequences: Sequence[str] = ()
+    starts: Sequence[Any] = ()
     emission: str = ""
 
     @classmethod
@@ -100,7 +103,7 @@ class ForecastSamples:
         keys = [_key(key, name) for key in given] if isinstance(given, Mapping) else None
         listed = given.values() if isinstance(given, Mapping) else given
         items = [_item(item, f"{name}[{n}]") for n, item in enumerate(listed)]
-        values, columns, sequences = zip(*items, strict=True)
+        values, columns, sequences, starts = zip(*items, strict=True)
         kinds = [(tuple(window.shape), *names) for window, names in zip(values, columns, strict=True)]
         if len({*kinds}) > 1 or values[0].ndim != 3:
             other = next((n for n, kind in enumerate(kinds) if kind != kinds[0]), 0)
@@ -108,7 +111,8 @@ class ForecastSamples:
                 f"{name!r} must have samples (K, T, D) of each window, with one shape and one order of columns; item 0 "
                 f"has {kinds[0]!r:.300}, and item {other} has {kinds[other]!r:.300}"
             )
-        return cls(torch.stack(values, 1), keys, columns[0], sequences if keys is None else ())
+        sequences, starts = (sequences, starts) if keys is None else ((), ())
+        return cls(torch.stack(values, 1), keys, columns[0], sequences, starts)
 
     def arranged(self, axes: str) -> ForecastSamples:
         """Return the samples with their axes in the order (K, N, T, D).
@@ -179,10 +183,25 @@ class ForecastSamples:
                     f"{name!r} has the {kind} {[*found][:MOST]!r:.500}; expected, in this order, "
                     f"{[*expected][:MOST]!r:.500}"
                 )
+        for ((_, sequence, start), when), ((_, following, later), then) in pairwise(
+            zip(windows.keys, () if self.keys else self.starts, strict=False)
+        ):
+            if sequence != following or None in (when, then) or when == then:
+                continue
+            if (when < then) != (start < later):
+                raise ValueError(
+                    f"{name!r} has a forecast from {when} before one from {then} of sequence {sequence!r}; expected "
+                    f"the order of the windows, whose first steps are {start} and {later}"
+                )
         values = tensor_of(self.values)
-        values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
+        is_real = values.is_floating_point()
         order = torch.arange(count) if self.keys is None else self._order(windows.keys, name)
-        return shape[0], lambda part: values[:, order[part]]
+
+        def futures(part: slice) -> Tensor:
+            chosen = values[:, order[part]]
+            return chosen if is_real else chosen.double()  # float32 would round large counts
+
+        return shape[0], futures
 
     def _order(self, keys: Sequence[Key], name: str) -> Tensor:
         """Return the place in these samples of each window of the evaluation."""
@@ -220,17 +239,17 @@ def _on_cpu(values: Tensor | np.ndarray) -> Tensor:
     return tensor.float() if tensor.dtype == torch.bfloat16 else tensor
 
 
-def _item(item: Any, name: str) -> tuple[Tensor, tuple[str, ...], str]:
-    """Return samples (K, T, D) of one window, names of columns, and the name of the sequence, if they are known."""
+def _item(item: Any, name: str) -> tuple[Tensor, tuple[str, ...], str, Any]:
+    """Return samples (K, T, D) of one window, names of columns, name of the sequence, and first time, if known."""
     if isinstance(item, Tensor | np.ndarray):
-        return _on_cpu(item), (), ""
+        return _on_cpu(item), (), "", None
     if hasattr(item, "all_values"):  # a TimeSeries of darts: (T, D, K)
         columns = tuple(map(str, item.components))
         named = columns != tuple(map(str, range(len(columns))))  # darts' own numbers
-        return torch.tensor(np.moveaxis(item.all_values(), -1, 0)), columns if named else (), ""
+        return torch.tensor(np.moveaxis(item.all_values(), -1, 0)), columns if named else (), "", item.start_time()
     if hasattr(item, "samples"):  # a SampleForecast of gluonts: (K, T), or (K, T, D)
         values = torch.tensor(np.asarray(item.samples))
-        return (values if values.ndim == 3 else values[..., None]), (), str(item.item_id or "")
+        return (values if values.ndim == 3 else values[..., None]), (), str(item.item_id or ""), item.start_date
     raise TypeError(
         f"{name} is a {type(item).__name__} without samples; give samples (K, T, D), a SampleForecast of gluonts or a "
         "TimeSeries of darts, since means and quantiles do not determine the scores"
@@ -305,6 +324,11 @@ def read_samples(path: str | os.PathLike[str], observed: int | None = None, axes
 
 def _of_arrays(arrays: Mapping[str, np.ndarray], observed: int | None) -> ForecastSamples:
     """Return samples from the members of an npz file."""
+    if (blend := arrays.get("blend")) is not None and blend.any():
+        raise ValueError(
+            f"its first {blend} steps are blended with the observed ones, so they are not the model's own forecasts; "
+            "write the file without `dvae forecast --blend` to score it"
+        )
     values, sequence = (next((arrays[n] for n in names if n in arrays), None) for names in NAMES.values())
     if values is None or values.dtype.kind not in "fiu":
         raise ValueError(

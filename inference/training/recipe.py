@@ -7,11 +7,14 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Self
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from ...data.schema import Schema, SchemaError
 from ...data.sequences import Source
 from ...options import check
+from ...program.batch import AnyBatch
+from ...program.model import DynamicalVAE
 from .objectives import Objective
 from .options import Stage, Training
 from .schedules import Schedule
@@ -47,6 +50,30 @@ class Recipe:
     def objective(self) -> Objective:
         """Objective of the last stage."""
         return self.stages[-1].objective
+
+
+@torch.enable_grad()
+def fit_factor(
+    model: DynamicalVAE, name: str, batch: AnyBatch, latents: Mapping[str, Tensor], steps: int, learning_rate: float
+) -> None:
+    """Fit the generative factor of a variable to a batch by Adam, before training, given values of the latents.
+
+    Args:
+        model: model of which only the parameters of this factor change.
+        name: name of the variable.
+        batch: as in `DynamicalVAE.model`.
+        latents: values (B, T, D) of the latents that the factor reads, and of the variable if it is a latent.
+        steps: number of steps.
+        learning_rate: step size.
+    """
+    optimizer = torch.optim.Adam(model.generator[name].parameters(), learning_rate)
+    for _ in range(steps):
+        run = model.rollout(batch)
+        run.values.update(latents)
+        optimizer.zero_grad()
+        (-run.distribution(name).log_prob(run.values[name]).mean()).backward()
+        optimizer.step()
+    optimizer.zero_grad()
 
 
 @dataclass(frozen=True)

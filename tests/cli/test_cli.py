@@ -103,6 +103,7 @@ def test_show_prints_the_audit_and_draws_the_graph(capsys, tmp_path):
     assert (tmp_path / "graph.png").read_bytes().startswith(b"\x89PNG")
     assert "exact: the guide reads everything" in show(*EQUATIONS)
     assert "q(z_t | z_{t-1}, x_{>=t})" in show(*EQUATIONS[:2])
+    assert "│ z_{<=t-2} │" in show("rslds")  # its states are summed out
     assert "the model has no latents" in show("--generative", "p(x_t | x_{<t})", "--inference", "")
 
 

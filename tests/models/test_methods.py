@@ -31,6 +31,7 @@ SMALL = {
     "rvae-noncausal": {"width": 4},
     "dsae": {"width": 4, "decoder": (4, 5)},
     "kvae": {"width": 4, "hidden": (5, 4)},
+    "rslds": {"states": 2, "width": 4, "hidden": (5,), "smoothing": 2},
     "hit-dvae": {"width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "frames": 5, "loss": "evidence"},
     "equations": {"width": 4},
 }
@@ -102,6 +103,19 @@ class TestDSAE(Contract):
 class TestKVAE(Contract):
     name = "kvae"
     missing: ClassVar = {"a": ("x_{>t}", "a_{<t}")}
+
+
+class TestRSLDS(Contract):
+    name = "rslds"
+    waits = 2  # torch checks the probabilities of the states
+    missing: ClassVar = {"z": ("z_{<=t-2}",)}
+
+
+class TestSLDS(Contract):
+    name = "rslds"
+    waits = 2
+    options: ClassVar = {"recurrent": False}
+    missing: ClassVar = {"z": ("z_{<=t-2}",)}
 
 
 class TestHiTDVAE(Contract):

@@ -334,6 +334,24 @@ def test_pit_is_uniform_for_data_from_the_model(emission):
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("text", ["p(x_t | x_{t-1})", "p(k_t | k_{t-1}) p(x_t | x_{t-1}, k_t)"])
+def test_data_that_read_data_of_the_same_step_have_their_marginal_prediction(text):
+    sizes = {"x": 1, "y": 1} | ({"k": Discrete(2)} if "k" in text else {})
+    torch.manual_seed(0)
+    model = build((f"{text} p(y_t | x_t)", ""), sizes, Dense(()), FixedNormal(1.0), observed=("x", "y"))
+    with torch.no_grad():
+        for parameter in model.generator["y"].network.parameters():
+            parameter.fill_(1.0)
+        model.generator["y"].head.log_scale.fill_(-3.0)
+    draws = model.sample(300, length=5)
+    filtered = model.filter(draws, 200, seed=0).filtered
+    for name in "xy":
+        assert uniformity(filtered.pit[name]) > 1e-3
+        error = draws[name] - filtered.predicted_mean[name]
+        assert abs((error.square() / filtered.predicted_variance[name]).mean() - 1) < 0.2
+
+
+@torch.no_grad()
 def test_filtered_intervals_cover_the_latents():
     torch.manual_seed(0)
     model = build(PAIRS["vrnn"], {"z": 1, "x": 2}, Recurrent(6), FixedNormal(0.6))
@@ -495,6 +513,7 @@ REFUSALS = [
     ("needs the first steps", lambda: start(None)),
     ("missing in the batch are x", lambda: start({})),
     ("leave out the other arguments", lambda: start(resume="state")),
+    ("leave out the other arguments", lambda: start(None, lag=1, resume="state")),
     ("has 2 sequences, but the update has 3", lambda: start().update(torch.zeros(3, 3))),
     ("missing in the batch are x", lambda: start().update({})),
     ("leave out 'lengths'", lambda: start().update({"x": ZERO, "lengths": torch.tensor([1, 3])})),

@@ -84,7 +84,7 @@ VALUES: dict[str, tuple[Any, ...]] = {  # small ones, and those that types do no
     "data_frames": (5,),
     "output_frames": (5,),
     "latents": ({},),
-    "states": ({},),
+    "states": (3, 2),
 }
 
 

@@ -18,7 +18,8 @@ from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 
 WITHOUT_LATENTS = ["autoregressive", "moglow"]
-METHODS = ["vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", *WITHOUT_LATENTS]
+METHODS = ["vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", "rslds"]
+METHODS += WITHOUT_LATENTS
 SCHEMA = PanelSchema(
     columns=Columns((Column("y"), Column("plan", "known"), Column("height", "static"))),
     means={"y": 0.0, "plan": 0.0, "height": 0.0},
@@ -50,7 +51,8 @@ def test_methods_read_covariates_if_and_only_if_the_data_have_them(name):
                 assert not covariates
     transition = next(factor for factor in model.generative.factors if factor.child in (*model.latents, "x"))
     is_read = {parent.name for parent in transition.parents} >= {"c", "d", "s"}
-    assert is_read == (name not in ("dsae", "kvae"))  # w of dsae is static, and the chain of kvae reads its own past
+    # w of dsae is static, and the chains of kvae and rslds read their own past
+    assert is_read == (name not in ("dsae", "kvae", "rslds"))
     assert not method.build(PanelSchema(columns=Columns((Column("y"),)))).context
     equations = methods()[name].generative
     plain = method.build({"x": 3})

@@ -347,3 +347,13 @@ def test_lags_are_known_beyond_the_table_up_to_the_shortest_one():
     assert ahead(panel, schema).all()["c"][:, -1, 5:10].all()  # indicators of the first lag
     with pytest.raises(ValueError, match="lag 3 is below the horizon 4, so its values are unknown"):
         ahead(panel, schema, 4)
+
+
+def test_lags_of_uneven_steps_are_warned_of():
+    values, days = np.arange(40.0)[:, None] % 7, np.arange(40.0)
+    columns = Columns((Column("y"),), time="date", lags=(7,))
+    whole = Panel([Series(f"s{n}", values, days) for n in range(6)], columns)
+    assert PanelSchema.from_data(whole, Cut(4, 3)).step == 0
+    kept = np.arange(40) % 9 != 3
+    with pytest.warns(UserWarning, match=r"uneven steps, and lags count rows: a lag of 7 rows is not"):
+        PanelSchema.from_data(Panel([Series(f"s{n}", values[kept], days[kept]) for n in range(6)], columns), Cut(4, 3))

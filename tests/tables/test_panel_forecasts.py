@@ -24,7 +24,8 @@ pd = pytest.importorskip("pandas")
 NAN = np.nan
 SMALL = {"latent": 2, "warm_up": 1}
 WITHOUT_LATENTS = ("autoregressive", "moglow")
-METHODS = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", *WITHOUT_LATENTS)
+METHODS = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "rvae-noncausal", "dsae", "kvae", "rslds")
+METHODS += WITHOUT_LATENTS
 PLAIN = ("erd", "aclstm")
 """Deterministic methods for motion that accept any data."""
 COLUMNS = Columns(

@@ -80,6 +80,11 @@ def test_priors_come_from_training_sequences_and_survive_the_configuration(data)
     old = {name: value for name, value in schema.config().items() if name != "priors"}
     with pytest.raises(SchemaError, match="need a column of numbers or counts"):
         PanelSchema.from_config(old).in_units("series")
+    hurdle = Columns((Column("rain", family="hurdle"),))
+    rain = Panel([Series(str(n), np.arange(20.0)[:, None] % 3) for n in range(6)], hurdle)
+    for units in ("logs", "seasonal", "changes"):
+        with pytest.raises(SchemaError, match="take the units columns"):
+            PanelSchema.from_data(rain, Cut(4, 3)).in_units(units)
 
 
 def test_levels_of_counts_use_earlier_observed_steps_alone(data):

@@ -24,7 +24,7 @@ from .metrics import several_futures
 
 UNITS: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Metres per unit."""
-FAR = 100.0
+FAR = 30.0
 """Ratio of the mean positions in forecasts and data, or its inverse, above which a unit is doubtful."""
 
 Paper = Literal["dlow", "gsps", "humanmac"]

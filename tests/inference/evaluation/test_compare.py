@@ -124,6 +124,7 @@ def test_leave_future_out_is_compared_next_to_the_evidence(fitted):
     text = str(result)
     assert ("L = 2, M = 1" in text, "95 % (df)" in text) == (True, False)
     assert str(Comparison.from_json(result.to_json())) == text
+    assert "FIVO bound" in str(run(models, x, leave_future_out=(2, 1), filter_particles=5))
     parts = [run({name: seeds}, x, leave_future_out=(2, 1)) for name, seeds in models.items()]
     assert parts[0].join(parts[1]).to_json() == result.to_json()
     without = run(models, x)

@@ -83,10 +83,13 @@ FORMS = {
     "mapping by name": lambda x, windows, path: {key[1:]: x[:, n].numpy() for n, key in enumerate(windows.keys)},
     "list": lambda x, windows, path: list(x.movedim(1, 0)),
     "gluonts": lambda x, windows, path: [
-        SimpleNamespace(samples=x[:, n].numpy(), item_id=key[1]) for n, key in enumerate(windows.keys)
+        SimpleNamespace(samples=x[:, n].numpy(), item_id=key[1], start_date=key[2])
+        for n, key in enumerate(windows.keys)
     ],
     "darts": lambda x, windows, path: [
-        SimpleNamespace(all_values=lambda n=n: x[:, n].movedim(0, -1).numpy(), components=pd.Index(["a", "b"]))
+        SimpleNamespace(
+            all_values=lambda n=n: x[:, n].movedim(0, -1).numpy(), components=pd.Index(["a", "b"]), start_time=lambda: 0
+        )
         for n in range(N)
     ],
     "npz": lambda x, windows, path: save_npz(path / "a.npz", x, windows),
@@ -139,6 +142,13 @@ def test_forecasts_of_other_types_are_scored_in_the_precision_of_the_truth(own, 
     assert score(rounded, windows)["theirs"]["CRPS"].mean == pytest.approx(expected, rel=1e-6)
 
 
+def test_large_counts_are_not_rounded(own, windows):
+    counts = own[0].mul(10).round().long() + 2**28
+    far = ArrayWindows(windows.x * 10 + 2**28, OBSERVED)
+    expected = score(counts.double(), far)["theirs"]["CRPS"].mean
+    assert score(counts, far)["theirs"]["CRPS"].mean == pytest.approx(expected, rel=1e-6)
+
+
 WRONG = {
     "no window axis": (lambda x, w: x[:, 0], r"shape \(9, 3, 2\), expected samples \(K, N, T, D\) = \(K, 7, 3, 2\)"),
     "missing windows": (lambda x, w: x[:, 1:], r"shape \(9, 6, 3, 2\), expected .* \(K, 7, 3, 2\)"),
@@ -177,7 +187,7 @@ WRONG = {
         r"columns \['b', 'a'\]; expected, in this order, \['a', 'b'\]",
     ),
     "sequences in another order": (
-        lambda x, w: [SimpleNamespace(samples=x[:, n].numpy(), item_id=str(6 - n)) for n in range(N)],
+        lambda x, w: [SimpleNamespace(samples=x[:, n].numpy(), item_id=str(6 - n), start_date=n) for n in range(N)],
         r"sequences \['6', '5', .*; expected, in this order, \['0', '1'",
     ),
 }
@@ -247,6 +257,20 @@ def test_exported_windows_are_the_past_and_the_keys(panel):
     train = windows_to_forecast(panel.windows("train"), whole=True)
     both = np.concatenate([train["observed"], train["future"]], 1)
     np.testing.assert_array_equal(both, panel.windows("train").all().mask_to_nan())
+
+
+def test_forecasts_of_a_sequence_in_another_order_are_refused(panel):
+    windows = panel.windows("test")
+    futures = windows.all()["x"][:, windows.protocol.observed :].numpy()[:, None]
+    listed = [
+        SimpleNamespace(samples=each, item_id=key[1], start_date=pd.Period("2024-01-01", "D") + key[2])
+        for each, key in zip(futures, windows.keys, strict=True)
+    ]
+    assert score(listed, windows)["theirs"]["energy score"].mean == 0
+    same = [n for n in range(len(listed) - 1) if windows.keys[n][1] == windows.keys[n + 1][1]]
+    listed[same[0]], listed[same[0] + 1] = listed[same[0] + 1], listed[same[0]]
+    with pytest.raises(ValueError, match=r"a forecast from 2024-.* before one from .*; expected the order"):
+        score(listed, windows)
 
 
 def test_files_that_forecasts_of_tables_wrote_are_scored_or_refused_with_a_reason(panel, tmp_path):
