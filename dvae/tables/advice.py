@@ -55,7 +55,7 @@ def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
     return [
         *_spikes(columns, values),
         *_split(panel, cut, guessed),
-        *_absent(times),
+        *(() if panel.columns.lags else _absent(times)),  # with lags, the schema warns
         *dated,
         *_leaks(*compared),
         *_scales(columns, sequences),
@@ -119,8 +119,8 @@ def _absent(times: Sequence[np.ndarray]) -> Iterator[str]:
     is_long = gaps > EVEN * np.median(gaps) if len(gaps) else np.zeros(1, bool)
     if 0 < is_long.mean() < FEW and gaps[~is_long].max() <= EVEN * gaps.min():
         yield (
-            f"{is_long.sum()} steps are longer than the others, so the table counts as uneven, and lags and horizons "
-            "count rows; if rows are absent, insert them with empty cells, for example by pandas' asfreq"
+            f"{is_long.sum()} steps are longer than the others, so the table counts as uneven, and a horizon counts "
+            "rows; if rows are absent, insert them with empty cells, for example by pandas' asfreq"
         )
 
 

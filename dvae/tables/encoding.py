@@ -214,6 +214,12 @@ class PanelSchema(Schema):
                 "always the same time; add the missing rows, with empty targets, if that matters",
                 stacklevel=2,
             )
+        if unseen := [lag for lag in panel.columns.lags if lag >= max(ends)]:
+            warnings.warn(
+                f"training never observes the value at lag {unseen[0]}: it ends after {max(ends)} rows of the longest "
+                f"sequence of {panel.name}; give shorter lags",
+                stacklevel=2,
+            )
         units: dict[str, Any] = {"means": means, "scales": scales, "logarithms": logarithms}
         windows = _TrainingWindows(training, cut)
         units["priors"] = _estimate_priors(panel.columns, windows)

@@ -357,3 +357,12 @@ def test_lags_of_uneven_steps_are_warned_of():
     kept = np.arange(40) % 9 != 3
     with pytest.warns(UserWarning, match=r"uneven steps, and lags count rows: a lag of 7 rows is not"):
         PanelSchema.from_data(Panel([Series(f"s{n}", values[kept], days[kept]) for n in range(6)], columns), Cut(4, 3))
+
+
+def test_lags_beyond_the_training_steps_are_warned_of(recwarn):
+    values = np.arange(40.0)[:, None] % 7
+    for lag in (39, 40):
+        columns = Columns((Column("y"),), lags=(lag,))
+        PanelSchema.from_data(Panel([Series(f"s{n}", values) for n in range(6)], columns), Cut(4, 3))
+    (warning,) = recwarn
+    assert "training never observes the value at lag 40: it ends after 40 rows" in str(warning.message)
