@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, Listed, axis_names, cluster_keys, sequences, take_split
 from ...program.model import DynamicalVAE
-from ..bounds.elbo import require_likelihood
+from ..bounds.elbo import bound_notes, require_likelihood
 from ..bounds.particles import obstacle
 from ..bounds.teacher_forced import bounds, filtered, information, length_of, variances
 from .comparison import Comparison, ModelResult
@@ -212,7 +212,7 @@ def _score_model(
 
         with seeded_evaluation(model, seed):
             scores = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
-        scores["notes"] = []
+        scores["notes"] = list(bound_notes(label, model))
         if filter_particles and (reason := obstacle(model, model.read(on_device_of(model, batch)))):
             scores["notes"].append(f"no FIVO bound: {reason}")
         elif filter_particles:
