@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
@@ -30,24 +30,31 @@ from torch.distributions import constraints
 from torch.nn import functional
 from typing_extensions import override
 
-from ..factorization.relations import ALL
-from ..networks.base import Input, NetworkSpec, perceptron
 from .base import ConditionalDistribution, Parameters, Shape
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 """Step of the additive sequence of levels: the multiples of the golden ratio, modulo 1, have low discrepancy."""
 FREQUENCIES = (1, 2, 4, 8)
 """Frequencies of the level's sines and cosines, which the denoiser reads."""
+LEVEL_SIZE = 2 * len(FREQUENCIES)
 EXACT_DIMENSION = 64
 """Largest number of coordinates for which `exact_log_prob` computes the trace exactly by default."""
+
+
+class DenoiserSpec(Protocol):
+    """Description of a denoiser of all steps, such as `networks.Denoiser`."""
+
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the module, whose arguments and result are those of `networks.denoising.SequenceDenoiser`."""
+        ...
 
 
 @dataclass(frozen=True)
 class Diffusion:
     """Variational diffusion model. `log_prob` is a stochastic lower bound, which `density` declares.
 
-    Without a `network`, a perceptron denoises the variable at one step (or a static variable) given the features. With
-    a `network`, all steps are denoised jointly, for a factor p(x_{1:T} | h). Its parents must be static, or read at
+    By default, a perceptron denoises the variable at one step (or a static variable) given the features. With a
+    `denoiser`, all steps are denoised jointly, for a factor p(x_{1:T} | h). Its parents must be static, or read at
     {1:T}, {<=t} or {<t}. The denoiser at step t then reads the noisy steps 1 to T, or 1 to t if a parent is restricted
     to the past. Entries are observed or missing by step.
 
@@ -55,9 +62,7 @@ class Diffusion:
 
     Args:
         hidden: widths of the perceptron.
-        network: network over time, such as `networks.SelfAttention()`; None for the perceptron.
-        cosine: whether the network reads and returns cosine coefficients over time instead of steps, as in HumanMAC
-            (Chen et al., 2023, arXiv 2302.03665); all steps must be visible.
+        denoiser: denoiser of all steps, such as `networks.Denoiser()`; None for the perceptron.
         schedule: "learned" is linear in the log signal-to-noise ratio, with learned ends; "cosine" is linear in the
             angle a, with fixed ends.
         log_snr: lowest and highest log signal-to-noise ratio, the initial ones if they are learned.
@@ -72,8 +77,7 @@ class Diffusion:
     """
 
     hidden: tuple[int, ...] = (128, 128)
-    network: NetworkSpec | None = None
-    cosine: bool = False
+    denoiser: DenoiserSpec | None = None
     schedule: Literal["learned", "cosine"] = "learned"
     log_snr: tuple[float, float] = (-10.0, 10.0)
     steps: int = 20
@@ -86,7 +90,7 @@ class Diffusion:
     @property
     def joint(self) -> bool:
         """Whether all steps are drawn jointly."""
-        return self.network is not None
+        return self.denoiser is not None
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
@@ -125,13 +129,12 @@ class FlowMatching:
 
     Args:
         scale: the scale s, above 0.
-        hidden, network, cosine, steps, drop, guidance, residual: as in `Diffusion`.
+        hidden, denoiser, steps, drop, guidance, residual: as in `Diffusion`.
         sampler: "ddim" (first order) or "heun".
     """
 
     hidden: tuple[int, ...] = (128, 128)
-    network: NetworkSpec | None = None
-    cosine: bool = False
+    denoiser: DenoiserSpec | None = None
     steps: int = 20
     sampler: Literal["ddim", "heun"] = "heun"
     drop: float = 0.0
@@ -142,7 +145,7 @@ class FlowMatching:
     @property
     def joint(self) -> bool:
         """Whether all steps are drawn jointly."""
-        return self.network is not None
+        return self.denoiser is not None
 
     def build(self, shape: Shape) -> ConditionalDistribution:
         """Return the module for a variable of this shape.
@@ -191,20 +194,12 @@ class DenoisingModule(ConditionalDistribution):
             )
         if spec.joint and (shape.relation is None or spec.residual):
             raise ValueError(
-                f"a {type(spec).__name__} with a network denoises all steps jointly, but {shape.name} "
+                f"a {type(spec).__name__} with a `denoiser` denoises all steps jointly, but {shape.name} "
                 f"{'has a residual' if spec.residual else 'is not the only variable of a factor p(x_{1:T} | ...)'}; "
-                "use network=None"
-            )
-        if spec.cosine and shape.relation != ALL:
-            raise ValueError(
-                f"cosine coefficients contain all steps, but {shape.name} is "
-                f"{'restricted to the past' if spec.joint else 'denoised by step'}; use cosine=False"
+                "use denoiser=None"
             )
         self.spec, self.joint_steps = spec, spec.joint
-        if spec.joint:
-            self.denoiser: Any = SequenceDenoiser(spec.network, shape, spec.cosine)
-        else:
-            self.denoiser = StepDenoiser(spec.hidden, shape)
+        self.denoiser: Any = spec.denoiser.build(shape) if spec.joint else StepDenoiser(spec.hidden, shape)
         self.hidden_features = nn.Parameter(torch.zeros(shape.features)) if spec.drop else None
 
     def angle(self, t: Tensor) -> Tensor:
@@ -481,66 +476,30 @@ class StepDenoiser(nn.Module):
 
     def __init__(self, hidden: tuple[int, ...], shape: Shape):
         super().__init__()
-        self.layers = perceptron([shape.size + 2 * len(FREQUENCIES) + shape.features, *hidden], "gelu")
-        self.out = _small(hidden[-1], shape.size)
+        widths = [shape.size + LEVEL_SIZE + shape.features, *hidden]
+        layers = [[nn.Linear(a, b), nn.GELU()] for a, b in pairwise(widths)]
+        self.layers = nn.Sequential(*(part for layer in layers for part in layer))
+        self.out = small_linear(widths[-1], shape.size)
 
     def forward(self, z: Tensor, angle: Tensor, features: Tensor) -> Tensor:
         """Return v (..., D) for z (..., D), angles (..., 1) and features (..., H)."""
-        levels = _embed(angle).expand(*z.shape[:-1], -1)
+        levels = embed_level(angle).expand(*z.shape[:-1], -1)
         v: Tensor = self.out(self.layers(torch.cat([z, levels, features], -1)))
         return v.to(z.dtype)
 
 
-class SequenceDenoiser(nn.Module):
-    """A network over time from noisy values, the level and features to estimates of v at all steps.
-
-    A frame of its input consists of the noisy value, the features, and an indicator of an observed step.
-
-    Args:
-        network: description of the network.
-        shape: the variable and its features; its `relation` contains the frames that step t reads.
-        cosine: whether the network reads and returns cosine coefficients over time instead of steps.
-    """
-
-    def __init__(self, network: NetworkSpec, shape: Shape, cosine: bool = False):
-        super().__init__()
-        self.cosine = cosine
-        frame = Input("frame", shape.size + shape.features + 1, shape.relation)
-        self.network = network.build([frame, Input("level", 2 * len(FREQUENCIES))], True, shape.size)
-        self.out = _small(self.network.features, shape.size)
-
-    def forward(self, z: Tensor, angle: Tensor, features: Tensor, steps: Tensor) -> Tensor:
-        """Return v (..., T, D) for z (..., T, D), angles (..., 1, 1), features (..., T, H) and steps (..., T, 1)."""
-        frames = torch.cat([torch.where(steps > 0, z, 0.0), features, (steps > 0).to(z.dtype)], -1)
-        frames = torch.where(steps < 0, 0.0, frames)
-        lengths, frames = (steps >= 0).sum((-2, -1)).flatten(), frames.flatten(0, -3)
-        basis = _cosines(lengths, z.shape[-2], z.dtype) if self.cosine else None
-        frames = frames if basis is None else basis @ frames
-        parents = {"frame": frames, "level": _embed(angle[..., 0, :]).flatten(0, -2)}
-        v: Tensor = self.out(self.network(parents, z.shape[-2], lengths)).to(z.dtype)
-        return (v if basis is None else basis.mT @ v).unflatten(0, z.shape[:-2])
-
-
-def _embed(angle: Tensor) -> Tensor:
+def embed_level(angle: Tensor) -> Tensor:
     """Return sines and cosines (..., 8) of multiples of the log signal-to-noise ratio of angles (..., 1)."""
     ratio = torch.log(angle.tan().clamp(1e-4, 1e4)) / math.log(1e4) * (math.pi / 4)
     return torch.cat([f(k * ratio) for k in FREQUENCIES for f in (torch.sin, torch.cos)], -1)
 
 
-def _cosines(lengths: Tensor, length: int, dtype: torch.dtype) -> Tensor:
-    """Return the orthonormal DCT-II matrix (B, T, T) of the valid steps of each sequence, 0 elsewhere."""
-    steps = torch.arange(length, dtype=dtype, device=lengths.device)
-    n, k = lengths.to(dtype)[:, None, None], steps[:, None]
-    basis = (math.pi * (steps + 0.5) * k / n).cos() * ((k > 0) + 1.0).sqrt() / n.sqrt()
-    return basis * ((k < n) & (steps < n))
-
-
-def _small(features: int, size: int) -> nn.Linear:
+def small_linear(features: int, size: int) -> nn.Linear:
     """Return a linear layer with small weights, so that the initial distribution is almost normal."""
     layer = nn.Linear(features, size)
     with torch.no_grad():
-        layer.weight *= 0.01
-        layer.bias *= 0.01
+        layer.weight.mul_(0.01)
+        layer.bias.mul_(0.01)
     return layer
 
 

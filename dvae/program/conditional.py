@@ -352,7 +352,7 @@ class Conditional(nn.Module):
         if self.joint:
             raise ValueError(
                 f"{self.factor} draws all steps of {self.factor.child} jointly, but here they are drawn step by step; "
-                "use a distribution of single steps, such as Diffusion(network=None)"
+                "use a distribution of single steps, such as Diffusion(denoiser=None)"
             )
         if self.network is None:
             return tuple(p.unbind(1) for p in self(parents, batch, length))

@@ -8,14 +8,15 @@ from torch.distributions import MultivariateNormal
 
 import dvae
 from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
-from dvae.distributions.diffusion import _cosines
-from dvae.networks import Attention, Recurrent, SelfAttention
+from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
+from dvae.networks.denoising import ragged_cosine_basis
 from dvae.testing import FactorizationContract
 
 COVARIANCE = torch.tensor([[1.0, 0.6], [0.6, 0.5]], dtype=torch.float64)
 LOCATION = torch.tensor([0.5, -1.0], dtype=torch.float64)
 DATA = MultivariateNormal(LOCATION, COVARIANCE)
-JOINT = SelfAttention(width=8, heads=2)
+COSINE = {"p(x)": Diffusion(denoiser=Denoiser(cosine=True))}
+JOINT = Denoiser(SelfAttention(width=8, heads=2))
 
 
 def optimal(z, angle, features, *steps):
@@ -190,7 +191,7 @@ class OneDistributionOfAllSteps(FactorizationContract):
     """Base of contracts of emissions that are drawn jointly."""
 
     training_steps = 20
-    spec = Diffusion(network=JOINT, steps=3)
+    spec = Diffusion(denoiser=JOINT, steps=3)
 
     def test_the_log_joint_is_that_of_the_per_step_program(self):
         pytest.skip("the shares of the steps in a joint bound are not conditional densities")
@@ -207,16 +208,16 @@ class OneDistributionOfAllSteps(FactorizationContract):
         pytest.skip("this test forecasts given past steps, which a distribution of all steps does not support")
 
 
-@pytest.mark.parametrize("network", [JOINT, Recurrent(width=4)])
+@pytest.mark.parametrize("network", [SelfAttention(width=8, heads=2), Recurrent(width=4)])
 def test_cosine_coefficients_are_another_basis_of_the_same_noise(network):
     """Padding changes nothing, and the basis of each sequence is orthonormal."""
-    spec = Diffusion(network=network, cosine=True, steps=2)
+    spec = Diffusion(denoiser=Denoiser(network, cosine=True), steps=2)
     model = freeze(dvae.DynamicalVAE("p(x_{1:T})", "", {"x": 2}, distributions={"p(x)": spec}).double())
     x, lengths = torch.randn(3, 5, 2).double(), torch.tensor([5, 3, 1])
     logs = model.log_joint({"x": x, "lengths": lengths}, {})["x"]
     for i, n in enumerate(lengths):
         torch.testing.assert_close(logs[i : i + 1], model.log_joint(x[i : i + 1, :n], {})["x"])
-    basis = _cosines(lengths, 5, torch.float64)
+    basis = ragged_cosine_basis(lengths, 5, torch.float64)
     identity = (torch.arange(5) < lengths[:, None]).double().diag_embed()
     torch.testing.assert_close(basis @ basis.mT, identity)
 
@@ -235,7 +236,7 @@ class TestItsEmissionIsOneDiffusion(OneDistributionOfAllSteps):
 @pytest.mark.parametrize(("steps", "causal"), [("{<=t}", True), ("{1:T}", False)])
 def test_the_masks_hold_at_every_level_and_for_draws(network, steps, causal):
     factor = f"p(x_t | x_{{<t}}, h_{steps})"
-    distributions = {"p(x)": Diffusion(network=network, steps=3)}
+    distributions = {"p(x)": Diffusion(denoiser=Denoiser(network), steps=3)}
     model = dvae.DynamicalVAE(factor, "", {"x": 2, "h": 1}, Attention(8, 2), distributions).double()
     z, noise, h = torch.randn(1, 5, 2).double(), torch.randn(1, 5, 2).double(), torch.randn(1, 5, 1).double()
     conditional = model.generator["x"]
@@ -259,7 +260,7 @@ def test_the_masks_hold_at_every_level_and_for_draws(network, steps, causal):
 
 @pytest.mark.parametrize("kind", [Diffusion, FlowMatching])
 def test_missing_steps_and_padding_change_nothing_else(kind):
-    spec = kind(network=JOINT, steps=2)
+    spec = kind(denoiser=JOINT, steps=2)
     model = freeze(dvae.DynamicalVAE("p(x_{1:T} | s)", "", {"x": 2, "s": 1}, distributions={"p(x)": spec}).double())
     x, s = torch.randn(2, 5, 2).double(), torch.randn(2, 1).double()
 
@@ -285,7 +286,7 @@ def test_missing_steps_and_padding_change_nothing_else(kind):
 
 
 def test_a_predictor_forecasts_whole_futures():
-    pair, spec = ("p(x_{1:T} | s)", ""), Diffusion(network=JOINT, steps=2)
+    pair, spec = ("p(x_{1:T} | s)", ""), Diffusion(denoiser=JOINT, steps=2)
     view = dvae.data.views.Past("s", 3)
     model = dvae.DynamicalVAE(*pair, {"x": 2, "s": 6}, distributions={"p(x)": spec}, view=view)
     assert model.forecast(torch.randn(4, 3, 2), 5, samples=2)["x"].shape == (2, 4, 5, 2)
@@ -344,8 +345,8 @@ def test_a_loss_is_an_energy_and_has_no_bound():
         (lambda: Diffusion(guidance=2.0).build(Shape(2, 1)), "set `drop` above 0"),
         (lambda: Diffusion(drop=0.1).build(Shape(2)), "no parents"),
         (lambda: FlowMatching(sampler="ancestral").build(Shape(2)), "'ddim' or 'heun'"),
-        (lambda: Diffusion(network=JOINT).build(Shape(2)), "network=None"),
-        (lambda: Diffusion(cosine=True).build(Shape(2)), "cosine=False"),
+        (lambda: Diffusion(denoiser=JOINT).build(Shape(2)), "denoiser=None"),
+        (lambda: joint("p(x_t | x_{<t}, z_{<=t}) p(z_t)", "q(z_t | x_{1:T})", COSINE), "cosine=False"),
         (lambda: Product([((0,), FlowMatching()), ((1,), Normal())]).build(Shape(2)), "no density"),
         (lambda: joint("p(x_t | z_t) p(z_t)", "q(z_t | x_{1:T})"), "needs a factor such as"),
         (lambda: joint("p(x_t | x_{<t}, z_t) p(z_t)", "q(z_t | x_{1:T})"), "needs a factor such as"),
@@ -359,7 +360,7 @@ def test_mistakes_are_refused(build, message):
 
 
 def test_one_diffusion_is_the_prior_of_a_latent_sequence():
-    pair, spec = ("p(z_{1:T}) p(x_t | z_t)", "q(z_t | x_{1:T})"), Diffusion(network=JOINT, steps=2)
+    pair, spec = ("p(z_{1:T}) p(x_t | z_t)", "q(z_t | x_{1:T})"), Diffusion(denoiser=JOINT, steps=2)
     model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, distributions={"p(z)": spec})
     terms = dvae.SequenceELBO().terms(model, torch.randn(3, 5, 3))
     assert terms.bounded == ("z",)
@@ -368,5 +369,5 @@ def test_one_diffusion_is_the_prior_of_a_latent_sequence():
 
 
 def joint(generative, inference, distributions=None):
-    distributions = distributions or {"p(x)": Diffusion(network=JOINT)}
+    distributions = distributions or {"p(x)": Diffusion(denoiser=JOINT)}
     return dvae.DynamicalVAE(generative, inference, {"x": 2, "z": 1}, distributions=distributions)
