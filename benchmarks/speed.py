@@ -6,6 +6,9 @@
     linear    seconds of a training step over T, Recurrent: the exponent of a power law
     segments  segments seen as time-stamped frames over forward kinematics of as many poses, on one core
     filter    a Kalman chain of 10,000 steps in blocks over step by step; filter-step: with its gradients
+    stream    an update of an online filter with 1,600 particles over one step of its networks, without anything else:
+              VRNN, whose guide proposes, and SRNN, whose prior does; memory: the process's peak in 10,000 steps of a
+              stream over its peak in the first 1,000
     VARIANT   a training step (forward, backward, Adam) at the layer sizes of the public implementation over the
               forward and backward passes of its LSTM layers
 
@@ -47,6 +50,9 @@ TARGETS = {
     "segments": ("at most", 3.0),
     "filter": ("at most", 0.1),
     "filter-step": ("at most", 0.1),
+    "stream-vrnn": ("at most", 3.0),
+    "stream-srnn": ("at most", 3.0),
+    "stream-memory": ("under", 1.02),
     "srnn": ("at most", 1.6),
     "dsae": ("at most", 1.35),
     "storn": ("at most", 1.35),
@@ -325,6 +331,40 @@ def filters(device: torch.device, steps: int = 10_000, batch: int = 1, size: int
     return each[0][0] / each[0][1], each[1][0] / each[1][1]
 
 
+def update(name: str, x: Tensor) -> float:
+    """Return the time of an update of an online filter over one step of the networks of its particles.
+
+    Args:
+        name: name of the method.
+        x: data (B, D) of a step.
+    """
+    model = dvae.method(name, **FAMILY[name]).build({"x": x.shape[1]}).to(x.device).eval()
+    stream = model.filter(x[:, None].expand(-1, 4, -1), 1600 // len(x), seed=0)
+    engine = stream.engine
+
+    @torch.no_grad()
+    def networks() -> None:
+        for each in (*engine.guide.values(), *engine.prior.values()):
+            each.step(engine.position, engine.data | engine.paths)
+
+    a, b = seconds(lambda: stream.update(x), networks)
+    return a / b
+
+
+def stream_memory(steps: int = 10_000) -> float:
+    """Return the most memory that the process used in a stream of many steps, over the first 1,000."""
+    import resource  # not on Windows
+
+    model = dvae.method("vrnn", **FAMILY["vrnn"]).build({"x": 2}).eval()
+    stream = model.filter(torch.randn(1, 1, 2), 20, lag=5, seed=0)
+    peaks = []
+    for count in (1000, steps - 1000):
+        for _ in range(count):
+            stream.update(torch.randn(1, 2))
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return peaks[1] / peaks[0]
+
+
 def member(name: str, x: Tensor) -> float:
     """Return the time of a training step of a variant over its LSTM layers."""
     model = dvae.method(name, **FAMILY[name]).build({"x": SIZE}).to(x.device)
@@ -337,5 +377,7 @@ def rows(device: torch.device) -> dict[str, float]:
     numbers = {"program": program(x), "chain": chain(x), "cache": cache(device), "linear": linear(device)}
     if device.type == "cpu":
         numbers["segments"] = segments()
+        numbers["stream-memory"] = stream_memory()
     numbers["filter"], numbers["filter-step"] = filters(device)
+    numbers |= {f"stream-{name}": update(name, x[:16, 0]) for name in ("vrnn", "srnn")}
     return numbers | {name: member(name, x) for name in FAMILY}

@@ -41,9 +41,11 @@ if TYPE_CHECKING:
     from .inference.diagnostics.reference_posterior import reference_posterior
     from .inference.diagnostics.stein import stein_discrepancy
     from .inference.diagnostics.traversal import traverse
+    from .inference.diagnostics.weight_posterior import weight_posterior
     from .inference.evaluation.compare import compare
     from .inference.evaluation.comparison import Comparison
     from .inference.evaluation.conformal import PredictionBands, conformal_bands
+    from .inference.evaluation.ensemble import Ensemble
     from .inference.evaluation.evaluate import evaluate
     from .inference.evaluation.evaluation import Evaluation
     from .inference.training import schedules
@@ -73,6 +75,7 @@ __all__ = [
     "Descent",
     "Discrete",
     "DynamicalVAE",
+    "Ensemble",
     "Evaluation",
     "Evidence",
     "Factorization",
@@ -121,6 +124,7 @@ __all__ = [
     "tables",
     "traverse",
     "views",
+    "weight_posterior",
 ]
 
 _MODULES = {
@@ -142,10 +146,12 @@ _MODULES = {
         "inference.diagnostics.posteriors": "Descent Posterior posterior",
         "inference.diagnostics.stein": "stein_discrepancy",
         "inference.diagnostics.traversal": "traverse",
+        "inference.diagnostics.weight_posterior": "weight_posterior",
         "inference.diagnostics.reference_posterior": "reference_posterior",
         "inference.evaluation.compare": "compare",
         "inference.evaluation.comparison": "Comparison",
         "inference.evaluation.conformal": "PredictionBands conformal_bands",
+        "inference.evaluation.ensemble": "Ensemble",
         "inference.evaluation.evaluate": "evaluate",
         "inference.evaluation.evaluation": "Evaluation",
         "inference.training": "schedules",

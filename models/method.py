@@ -30,7 +30,7 @@ from ..distributions.priors import VampModule
 from ..factorization.inversion import guide
 from ..factorization.notation import Factorization
 from ..inference.training.objectives import Evidence, Objective
-from ..inference.training.options import Stage
+from ..inference.training.options import Stage, Training
 from ..inference.training.recipe import Recipe, Trainable
 from ..inference.training.schedules import Cosine, Logistic, Ramp, Schedule
 from ..networks import NetworkSpec
@@ -105,6 +105,11 @@ class LikelihoodMethod(Method):
             ignore it. None: 1 for data with a horizon that are not a table, and 0 for others.
     """
 
+    trainings: ClassVar[Mapping[str, Training]] = {
+        **Method.trainings,
+        "table": Training(1000, 64, 3e-3, decay=0.3, validate_every=50, select="forecast", patience=8),
+    }
+    """The options for tables were chosen on validation windows of public tables (docs/results/tables.md)."""
     without_covariates: ClassVar[tuple[str, ...]] = ()
     """Factors that read no covariates, such as "p(z)"."""
 

@@ -32,6 +32,7 @@ GROUPS = {
         "show": ("methods:show", "Show two equations: joint distributions, audit of the guide, graph."),
         "data info": ("data:info", "Describe motion files, or tables with a schema to edit."),
         "data convert": ("data:convert", "Convert motion files to another format, rate or skeleton."),
+        "data windows": ("assessment:windows", "Write the windows to forecast, for other software."),
         "data get": ("data:get", "Download and verify public recordings."),
     },
     "fit": {

@@ -8,12 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 import tyro
 
-from .. import motion
+from .. import files, motion
 from ..inference.evaluation.compare import compare as compare_models
+from ..inference.evaluation.ensemble import Ensemble
 from ..inference.evaluation.evaluate import evaluate as evaluate_models
+from ..inference.evaluation.external import ForecastSamples, read_samples, windows_to_forecast
 from ..inference.evaluation.scores import Scores
 from ..inference.training.checkpoints import CheckpointError, Run
 from ..locking import seeded
@@ -23,14 +26,18 @@ from ..motion.geometry.euler import euler_errors
 from ..motion.metric_models.pose_prior import PosePriorModel
 from ..motion.metric_models.quality import RealOrGenerated, quality
 from ..motion.scoring.by_action import action_windows, errors_by_action
+from ..motion.scoring.published import Paper, Root, Unit
 from ..runs import directory as runs
 from . import loading
-from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, note, save_figure
+from .console import ERROR, OUT, Failed, Missing, UsageError, arguments, at_least, check_files, note, save_figure
+from .fitting import CutOptions, DataOptions, ProtocolName
 from .futures import joint_names
 from .help import Expert
 
 MOST_REMEMBERED = 2**32
 """Maximum size in bytes of the training windows that references load; memory-mapped data may be larger."""
+AS_STORED = CutOptions()
+"""No options: data are read and cut as in the runs."""
 OBSERVATIONS = 50
 """Number of observations for the diversity of codes, as in the paper of Mix-and-Match."""
 
@@ -103,9 +110,52 @@ class Quality:
     quality_seeds: Expert[int] = 3
 
 
+@dataclass(frozen=True)
+class External:
+    """Forecasts of other software.
+
+    Args:
+        forecasts: files of samples (npz, npy or CSV), each a row named after its file; `dvae data windows` writes the
+            windows to forecast. Without runs, --data and the options of `dvae fit` for it define the windows.
+        protocol: without runs: protocol that cuts windows of motion; by default the protocol of the skeleton.
+        axes: a letter for each axis of the samples in npz and npy files: k samples, n windows, t steps, d columns, or j
+            joints and c coordinates; 1 for an axis of size 1. By default kntd or kntjc.
+        unit: for motion: unit of the forecasts.
+        root: for motion with a moving root, under a protocol that removes it: subtract it from the other joints, or
+            ignore it if they are already relative to it.
+    """
+
+    forecasts: tuple[Path, ...] = ()
+    protocol: ProtocolName | None = None
+    axes: Expert[str] = ""
+    unit: Expert[Unit] = "m"
+    root: Expert[Root | None] = None
+
+    def check(self) -> None:
+        """Raise a `UsageError` if two files have the same name, or options for files have no file."""
+        if len({path.stem for path in self.forecasts}) < len(self.forecasts):
+            raise UsageError(f"--forecasts {' '.join(map(str, self.forecasts))}: give files with different names")
+        if not self.forecasts and self != External():
+            raise UsageError("--protocol, --axes, --unit and --root need --forecasts; leave them out")
+
+    def read(self, windows: Any, every: Any) -> dict[str, ForecastSamples]:
+        """Return the forecasts by name; windows that are in `every` only are left out."""
+        read = {path.stem: read_samples(path, windows.protocol.observed, self.axes) for path in self.forecasts}
+        read = {name: each.within(every.keys, windows.keys) for name, each in read.items()}
+        if isinstance(windows, motion.Windows):
+            return {
+                name: motion.frames_of(each, windows, unit=self.unit, root=self.root) for name, each in read.items()
+            }
+        if self.unit != "m" or self.root:
+            raise UsageError("--unit and --root are for motion; leave them out")
+        return read
+
+
 def evaluate(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     control: Control,
+    external: External = External(),
+    source: Expert[CutOptions] = AS_STORED,
     angles: Angles = Angles(),
     realism: Quality = Quality(),
     data: str | None = None,
@@ -118,26 +168,30 @@ def evaluate(
     pose_prior: Path | None = None,
     classifier: tuple[Path, ...] = (),
     several_futures: bool = False,
+    windows_of: Expert[Paper | None] = None,
     seed: int = 0,
     batch_size: Expert[int] = 32,
     out: Path | None = None,
     figure: Path | None = None,
 ) -> None:
-    """Score runs on the test windows of their protocol, next to reference forecasts such as the last value.
+    """Score runs, or forecasts of other software, on test windows, next to references such as the last value.
 
     For runs of motion-latent, scores the reconstruction of test segments, next to principal components of equal
     dimension. Options for forecasts do not apply to them.
 
-    Prints the table, and writes it with all settings to evaluation.json in each run, or to --out. With given joints,
-    several futures, other data or another measure, the file name says so. Nearest neighbours require the training data
-    of the runs.
+    Prints the table, and writes it with all settings to evaluation.json in each run, or to --out. With given joints or
+    forecasts, chosen windows, other data or another measure, the file name says so. Nearest neighbours require the
+    training data of the runs.
 
     Args:
         run: run directories, fitted on the same data under the same protocol.
+        external: forecasts of other software.
         control: joints whose true paths are given to methods that take trajectories.
         angles: options of --measure angles.
         realism: options of --measure quality, whose defaults take hours on a CPU.
-        data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables.
+        source: without runs: how the data are read and cut, as in `dvae fit`.
+        data: where the data are now, if the path in the runs is no longer valid; or other data with the same variables;
+            or, without runs, the data.
         measure: scores of forecasts; or, for motion, their quality (how hard they are to distinguish from real motion),
             errors of their Euler angles (best of 1 and of K), or the diversity of the codes of mix-and-match.
         samples: number K of forecasts of each window.
@@ -147,6 +201,7 @@ def evaluate(
         classifier: runs of action-classifiers with different labels, which score the actions in the forecasts.
         several_futures: score only windows whose last observed pose is shared by another window, as GSPS's tables do.
             Without it, all windows are scored, as in DLow's.
+        windows_of: score the windows of Human3.6M that the public code of a paper scores.
         seed: seed of the draws.
         batch_size: number of windows forecast at once.
         out: file to write instead of evaluation.json in each run.
@@ -157,8 +212,14 @@ def evaluate(
     check_files(out, figure, ".json")
     if several_futures and control.exchange is not None:
         raise UsageError("--several-futures needs multimodal futures, which exchanged poses do not have; leave one out")
+    external.check()
+    is_of_segments = bool(run) and loading.kind_of(run, data) == "segments"
+    if external.forecasts and (measure != "forecasts" or is_of_segments):
+        raise UsageError("--forecasts is for scores of forecasts, not for another --measure or for segments")
+    if run and (external.protocol or source != AS_STORED):
+        raise UsageError("the runs define the windows; leave --protocol and options for reading the data out")
     scoring = ForecastScoring(
-        samples, log_score_particles, pose_prior, classifier, control, missing, failed, several_futures
+        samples, log_score_particles, pose_prior, classifier, control, missing, failed, several_futures, windows_of
     )
     chosen = [name for name, options in (("angles", angles), ("quality", realism)) if options != type(options)()]
     if wrong := next((name for name in chosen if name != measure), None):
@@ -175,12 +236,36 @@ def evaluate(
             raise UsageError(f"--measure {measure} has no figure; leave --figure out")
         _measure(measure, run, data, scoring, angles, realism, out, figure, seed=seed, batch_size=batch_size)
         return
-    score = _segments if loading.kind_of(run, data) == "segments" else _forecasts
+    score: Any = _segments if is_of_segments else partial(_forecasts, external=external, source=source)
     result, record = score(run, data, scoring, bound_particles=bound_particles, seed=seed, batch_size=batch_size)
     save_and_print(result, [each / f"{record}.json" for each in run] if out is None else [out], figure)
 
 
-OF_MOTION = ("pose_prior", "classifier", "control", "missing", "several_futures")
+def windows(
+    source: DataOptions, out: Path, part: Literal["train", "validation", "test", "train+validation"] = "test"
+) -> None:
+    """Write the windows that `dvae evaluate --forecasts` scores, so that other software can forecast them.
+
+    The npz contains `observed` (windows, steps, columns), NaN where missing; the keys `split`, `sequence` and `start`
+    of the windows, which a file of forecasts contains too; `horizon`, the number of steps to forecast; and the names of
+    the `columns`. Training and validation windows also have their `future`.
+
+    Args:
+        source: data, and how they are cut.
+        out: npz file to write.
+        part: part of the data.
+    """
+    check_files(out, None, ".npz")
+    arrays = windows_to_forecast(source.open_at(source.data).windows(part), whole=part != "test")
+    with files.atomic_write(out) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+    count, observed, size = arrays["observed"].shape
+    ERROR.print(
+        f"wrote {out}: {count} windows of {observed} observed steps of {size} columns; forecast {arrays['horizon']}"
+    )
+
+
+OF_MOTION = ("pose_prior", "classifier", "control", "missing", "several_futures", "windows_of")
 """Options of `evaluate` for motion only."""
 
 
@@ -196,39 +281,64 @@ class ForecastScoring:
     missing: bool = False
     failed: bool = False
     several_futures: bool = False
+    windows_of: Paper | None = None
 
 
-def _forecasts(paths: Sequence[Path], data: str | None, scoring: ForecastScoring, **settings: Any) -> tuple[Any, str]:
+def _forecasts(
+    paths: Sequence[Path],
+    data: str | None,
+    scoring: ForecastScoring,
+    external: External,
+    source: CutOptions,
+    **settings: Any,
+) -> tuple[Any, str]:
     """Score forecasts of test windows; return the scores and the name of their file."""
-    loaded = loading.with_equal_windows(paths, data, failed=scoring.failed)
-    data_set = loading.data_of(data, *loaded, missing=scoring.missing)
-    windows = loading.windows_to_test(loaded[0], data_set, whole_sequences=False)
+    loaded: list[runs.Loaded] = []
+    if paths or not external.forecasts:
+        loaded = loading.with_equal_windows(paths, data, failed=scoring.failed)
+        data_set = loading.data_of(data, *loaded, missing=scoring.missing)
+        windows = loading.windows_to_test(loaded[0], data_set, whole_sequences=False)
+    elif data is None or scoring.classifier:
+        raise UsageError("--forecasts needs --data, or runs; and --classifier needs runs")
+    else:
+        data_set = source.open_at(data, protocol=external.protocol, missing=scoring.missing)
+        windows = data_set.windows("test")
+    every = windows
+    if data_set.kind == "motion":
+        windows = motion.published_windows(windows, scoring.windows_of) if scoring.windows_of else windows
+        windows = motion.several_futures(windows) if scoring.several_futures else windows
+    with arguments():
+        given = external.read(windows, every)
     temperature = scoring.control.temperature
-    scores: Scores = loading.SCORES[loaded[0].config.kind]
-    if loaded[0].config.kind == "motion":
-        classifiers = _classifiers(scoring, data, loaded[0])
+    scores: Scores = loading.SCORES[data_set.kind]
+    if data_set.kind == "motion":
+        classifiers = _classifiers(scoring, data, loaded[0]) if loaded else {}
         scores = partial(
             motion.scores, pose_prior=_pose_prior(scoring, data, windows.skeleton), classifiers=classifiers
         )
-        windows = motion.several_futures(windows) if scoring.several_futures else windows
         windows = scoring.control.windows(windows, loaded)
     elif inapplicable := [name for name in OF_MOTION if getattr(scoring, name) != getattr(ForecastScoring, name)]:
         raise UsageError(
-            f"--{inapplicable[0].replace('_', '-')} is for motion, and {paths[0]} was fitted on a table; leave it out"
+            f"--{inapplicable[0].replace('_', '-')} is for motion, and {data_set.path} is a table; leave it out"
         )
+    models = {name: run.model for name, run in zip(loading.names(loaded), loaded, strict=True)}
+    if clash := models.keys() & given.keys():
+        raise UsageError(f"a run and a file of forecasts are both named {min(clash)}; rename the file")
+    is_known = not loaded or loading.is_training_data(loaded[0], data_set)
     result = evaluate_models(
-        {name: run.model for name, run in zip(loading.names(loaded), loaded, strict=True)},
+        {**given, **models},
         windows,
         scores=scores,
         samples=scoring.samples,
         log_score_particles=scoring.log_score_particles,
-        training_windows=_reference_windows(data_set) if loading.is_training_data(loaded[0], data_set) else None,
+        training_windows=_reference_windows(data_set) if is_known else None,
         configs={name: Run(run.path).config for name, run in zip(loading.names(loaded), loaded, strict=True)},
         options={} if temperature is None else {"temperature": temperature},
         **settings,
     )
-    subset = "-several-futures" * scoring.several_futures
-    return result, f"{loading.record('evaluation', loaded[0], data_set)}{scoring.control}{subset}"
+    record = loading.record("evaluation", loaded[0], data_set) if loaded else "evaluation"
+    subset = f"-{scoring.windows_of}" * bool(scoring.windows_of) + "-several-futures" * scoring.several_futures
+    return result, f"{record}{scoring.control}{subset}{''.join(f'-with-{name}' for name in given)}"
 
 
 def _measure(
@@ -357,6 +467,8 @@ def compare(
     particles: int = 100,
     estimates: Expert[int] = 1,
     filter_particles: Expert[int] = 0,
+    leave_future_out: tuple[int, int] | None = None,
+    ensembles: bool = False,
     contrasts: Expert[int] = 128,
     samples: int = 50,
     forecasts: bool = True,
@@ -378,6 +490,9 @@ def compare(
         particles: number K of particles of the IWAE bound.
         estimates: number of independent estimates of the IWAE bound; `to_arviz` of the result needs at least 25.
         filter_particles: number of particles of the FIVO bound; 0 omits it.
+        leave_future_out: L and M: also compare the log densities of M steps given all earlier ones, from L observed
+            steps on.
+        ensembles: add a row for the equal-weight mixture of the seeds of each row with several seeds.
         contrasts: number of windows for the mutual information of latents and data; 0 omits it.
         samples: number of forecasts of each window.
         forecasts: also score forecasts, which takes longest.
@@ -402,13 +517,20 @@ def compare(
         )
     windows = loading.windows_to_test(loaded[0], data_set, stride)
     rows = loading.rows(loaded)
+    models: dict[str, Any] = {name: [each.model for each in row] for name, row in rows.items()}
+    if ensembles:
+        several = {name: row for name, row in models.items() if len(row) > 1}
+        if not several:
+            raise UsageError("--ensembles needs runs that differ only in their seed; each row has one seed")
+        models |= {f"{name}, mixture of {len(row)} seeds": Ensemble(row) for name, row in several.items()}
     result = compare_models(
-        {name: [each.model for each in row] for name, row in rows.items()},
+        models,
         windows,
         scores=loading.SCORES[loaded[0].config.kind],
         particles=particles,
         estimates=estimates,
         filter_particles=filter_particles,
+        leave_future_out=leave_future_out,
         contrasts=contrasts,
         samples=samples if forecasts else 0,
         draw_emission=draw_emission,

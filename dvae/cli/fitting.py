@@ -91,13 +91,73 @@ else:
 
 
 @dataclass(frozen=True)
-class DataOptions(ColumnOptions):
+class CutOptions(ColumnOptions):
+    """How data are read and cut into windows.
+
+    Args:
+        skip_bad: leave out clips that cannot be used, instead of refusing the file.
+        observed: for a table: number of observed steps before a forecast.
+        horizon: for a table: number of steps to forecast.
+        stride: for a table: steps from one test window to the next.
+        split: for a table: divide sequences, time or groups into training, validation and test.
+        validation: for a table: share of the data for validation, which selects the weights.
+        test: for a table: share of the data for the test, or number of last steps of a split by time.
+        season: for a table: period in steps, which the seasonal reference forecast repeats.
+    """
+
+    skip_bad: Expert[bool] = False
+    observed: int | None = None
+    horizon: int | None = None
+    stride: Expert[int | None] = None
+    split: Literal["sequence", "time", "group"] | None = None
+    validation: Expert[Share | None] = None
+    test: Expert[Frames | Share | None] = None
+    season: Frames | None = None
+
+    def open_at(self, path: str, kind: str = "windows", user: str = "the data are", **further: Any) -> Any:
+        """Open data.
+
+        Args:
+            path: path of the data.
+            kind: kind of the data; "windows" for motion or a table.
+            user: subject of errors, such as "srnn is fitted on".
+            further: further options of motion, which are None or False if not given.
+
+        Raises:
+            UsageError: an option is for another kind of data.
+        """
+        given = {option: value for option, value in vars(self).items() if value != getattr(type(self), option)}
+        given = {name: value for name, value in given.items() if name != "data"}
+        given |= {name: value for name, value in further.items() if value}
+        table_options = [option for option in OF_KINDS["panel"] if option in given]
+        if kind == "windows":
+            kind = "panel" if is_table(path) or table_options else "motion"
+            if kind == "panel" and path == SIMULATED:
+                raise UsageError(f"--{table_options[0]} is for tables; give the path of a table with --data")
+        for other, options in OF_KINDS.items():
+            if other != kind and (inapplicable := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
+                raise UsageError(
+                    f"--{min(inapplicable).replace('_', '-')} is for {DATA_NAMES[other]}, and {user} {DATA_NAMES[kind]}"
+                )
+        columns = {field.name for field in fields(ColumnOptions)}
+        given = {name: value for name, value in given.items() if name not in columns} | self.given()
+        with arguments() if kind == "panel" else nullcontext():  # the columns of a table are arguments
+            data_set = DATA[kind].open(path, **given)
+        if isinstance(data_set, PanelData | motion.MotionData | motion.SegmentData):
+            for description in data_set.parts().values():
+                ERROR.print(description, markup=False)
+        if isinstance(data_set, PanelData):
+            warnings.filterwarnings("ignore", "training leaves out")  # the lines above list the omitted parts
+        return data_set
+
+
+@dataclass(frozen=True)
+class DataOptions(CutOptions):
     """Data to fit to: motion, or a table.
 
     Args:
         data: motion file or folder of motion files, or "simulated"; or a table: CSV, TSV, Parquet or npz; or an npy
             file or folder of npy files, which may be larger than memory.
-        skip_bad: leave out clips that cannot be used, instead of refusing the file.
         protocol: protocol that cuts windows; by default the protocol of the skeleton.
         representation: input of the model: positions of joints, or rotations of joints in this form, which keep the
             lengths of bones.
@@ -111,17 +171,9 @@ class DataOptions(ColumnOptions):
             AMASS keep their rotations and betas on it.
         betas: for motion-latent: number of shape parameters of the body in a file.
         hold_out: for motion-latent: folders of the data that are the test data, such as SFU TotalCapture.
-        observed: for a table: number of observed steps before a forecast.
-        horizon: for a table: number of steps to forecast.
-        stride: for a table: steps from one test window to the next.
-        split: for a table: divide sequences, time or groups into training, validation and test.
-        validation: for a table: share of the data for validation, which selects the weights.
-        test: for a table: share of the data for the test, or number of last steps of a split by time.
-        season: for a table: period in steps, which the seasonal reference forecast repeats.
     """
 
     data: str = SIMULATED
-    skip_bad: Expert[bool] = False
     protocol: ProtocolName | None = None
     representation: Expert[Representation] = "positions"
     missing: Missing = False
@@ -132,13 +184,6 @@ class DataOptions(ColumnOptions):
     body: Path | None = None
     betas: Expert[int] = 8
     hold_out: tuple[str, ...] = ()
-    observed: int | None = None
-    horizon: int | None = None
-    stride: Expert[int | None] = None
-    split: Literal["sequence", "time", "group"] | None = None
-    validation: Expert[Share | None] = None
-    test: Expert[Frames | Share | None] = None
-    season: Frames | None = None
 
     def open(self, *methods: Trainable) -> Any:
         """Open the data on which methods are fitted.
@@ -153,28 +198,7 @@ class DataOptions(ColumnOptions):
                 f"these methods are fitted on different kinds of data, {descriptions}; give methods of one kind"
             )
         ((kind, name),) = kinds.items()
-        given = {option: value for option, value in vars(self).items() if value != getattr(DataOptions, option)}
-        table_options = [option for option in OF_KINDS["panel"] if option in given]
-        if kind == "windows":
-            kind = "panel" if is_table(self.data) or table_options else "motion"
-            if kind == "panel" and self.data == SIMULATED:
-                raise UsageError(f"--{table_options[0]} is for tables; give the path of a table with --data")
-        for other, options in OF_KINDS.items():
-            if other != kind and (inapplicable := (given.keys() & {*options}) - {*OF_KINDS[kind]}):
-                raise UsageError(
-                    f"--{min(inapplicable).replace('_', '-')} is for {DATA_NAMES[other]}, and {name} is fitted on "
-                    f"{DATA_NAMES[kind]}"
-                )
-        columns = {field.name for field in fields(ColumnOptions)}
-        given = {name: value for name, value in given.items() if name not in columns} | self.given()
-        with arguments() if kind == "panel" else nullcontext():  # the columns of a table are arguments
-            data_set = DATA[kind].open(given.pop("data", SIMULATED), **given)
-        if isinstance(data_set, PanelData | motion.MotionData | motion.SegmentData):
-            for description in data_set.parts().values():
-                ERROR.print(description, markup=False)
-        if isinstance(data_set, PanelData):
-            warnings.filterwarnings("ignore", "training leaves out")  # the lines above list the omitted parts
-        return data_set
+        return self.open_at(self.data, kind, f"{name} is fitted on")
 
 
 OF_KINDS = {

@@ -46,6 +46,7 @@ class ColumnOptions:
         na_values: for a table: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: for a table: decimal sign of its numbers, if it cannot be detected.
         calendar: for a table: covariates computed from its dates, also beyond its last row.
+        lags: for a table: covariates that are earlier values of the targets, so many steps back.
     """
 
     columns: tuple[str, ...] = ()
@@ -59,6 +60,7 @@ class ColumnOptions:
     na_values: Expert[tuple[str, ...]] = ()
     decimal: Expert[Literal[".", ","] | None] = None
     calendar: tuple[Literal["hour", "weekday", "month", "day_of_year"], ...] = ()
+    lags: tuple[int, ...] = ()
 
     def given(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, under their names in `PanelData.open`."""

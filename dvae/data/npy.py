@@ -9,10 +9,11 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Collection
 from math import prod
 from mmap import mmap
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -85,6 +86,14 @@ def check_bytes(dtype: np.dtype, shape: tuple[int, ...], size: int, verb: str = 
         raise NpyError(f"{verb} shape {shape} of {dtype}, but holds {size:,} bytes{short}")
 
 
+def check_text(name: str, array: np.ndarray) -> None:
+    """Raise an `NpyError` if an array contains text with invalid characters."""
+    if array.dtype.kind == "U":
+        points = array.reshape(-1).view(f"{array.dtype.str[0]}u4")
+        if ((points > 0x10FFFF) | (points >> 11 == 0xD800 >> 11)).any():
+            raise NpyError(f"{name}: damaged: its text has invalid characters")
+
+
 def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
     """Return the numbers of an npy file as a read-only memory map; values are read from disk when they are used.
 
@@ -135,6 +144,41 @@ def mapped(path: str | os.PathLike[str], links: bool = False) -> np.ndarray:
             "write fewer, longer files",
             path,
         ) from error
+
+
+def npz_arrays(file: BinaryIO, most: int, names: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """Return the arrays of an npz file by name: numbers and text, without unpickling.
+
+    Args:
+        file: the open file.
+        most: maximum bytes of its content.
+        names: names of the arrays to read if there are several; all by default.
+
+    Raises:
+        NpyError: if the file is damaged, unpacks to more bytes, or contains objects or none of the arrays.
+    """
+    arrays = {}
+    try:
+        with zipfile.ZipFile(file) as archive:
+            entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+            if (size := sum(entry.file_size for entry in entries.values())) > most:
+                raise NpyError(f"it unpacks to {size:,} bytes; at most {most:,} are read")
+            selected = {*entries} & {*names} if names and len(entries) > 1 else {*entries}
+            if not selected:
+                raise NpyError(f"it holds {[*entries][:20]!r:.200}; expected arrays {', '.join(names)}")
+            for name, entry in entries.items():
+                if name in selected:
+                    with archive.open(entry) as member:
+                        dtype, shape, order = header(member.read)
+                        if dtype.hasobject:
+                            raise NpyError(f"{name[:100]!r} contains Python objects, expected numbers or text")
+                        check_bytes(dtype, shape, entry.file_size - member.tell())
+                        values = np.frombuffer(member.read(entry.file_size), dtype)
+                    arrays[name] = values.reshape(shape, order=order)
+                    check_text(f"{name[:100]!r}", arrays[name])
+    except Exception as error:  # the zip library raises many types for damaged bytes
+        raise NpyError(f"cannot be read as npz: {str(error)[:300]}") from error
+    return arrays
 
 
 def is_mapped(array: Any) -> bool:

@@ -51,6 +51,11 @@ class View:
     measured: str = ""
     """Quantity that densities refer to, if it is not the data as given; bounds of different quantities differ."""
 
+    @property
+    def by_step(self) -> bool:
+        """Whether each step is transformed alone, so that sequences can grow step by step; a subclass declares it."""
+        return type(self) is View
+
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
         """Check that a model is compatible with this view.
 
@@ -158,6 +163,7 @@ class ContextView(View):
     """
 
     names: tuple[str, ...] = ()
+    by_step = True
 
     @override
     def inverse(self, model_values: Batch) -> Batch:
@@ -179,6 +185,7 @@ class Dequantised(View):
 
     widths: tuple[float, ...]
     names = (WHOLE, "rounding_noise")
+    by_step = True
     measured = "values with uniform noise of the width of their rounding"
 
     @override
@@ -227,6 +234,11 @@ class Views(View):
         pasts = [index for index, view in enumerate(views) if isinstance(view, Past)]
         if not all(view.keeps_volume for view in views[: max(pasts, default=0)]):
             raise ValueError(f"{self} changes the volume of steps that are not scored; make Past the first view")
+
+    @property
+    @override
+    def by_step(self) -> bool:
+        return all(view.by_step for view in self.views)
 
     def __repr__(self) -> str:
         return f"Views({', '.join(map(repr, self.views))})"
@@ -294,6 +306,7 @@ class Parts(View):
 
     parts: Mapping[str, Sequence[int]] = field()
     names = (WHOLE,)
+    by_step = True
 
     @override
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:

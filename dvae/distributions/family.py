@@ -13,6 +13,7 @@ exponential of the output, and a scale matrix has a positive diagonal.
 | correlated | correlated numbers | `LowRankNormal` |
 | angle | radians from -pi to pi | von Mises |
 | positive, log-normal | positive numbers; positive numbers that span orders of magnitude | Gamma, LogNormal |
+| hurdle | positive numbers and exact zeros | `HurdleLogNormal` |
 | power | squared magnitudes of a spectrum | Exponential |
 | share | above 0 and below 1 | Beta |
 | binary | 0 or 1 | Bernoulli |
@@ -46,6 +47,7 @@ from ..constants import constant
 from ..options import nearest
 from .base import ConditionalDistribution, DistributionSpec, Parameters, Shape
 from .families import FixedNormal, Normal, StudentT
+from .hurdle import HurdleLogNormal
 from .precise import BoundedDistribution, DoublePrecision
 
 ALTERNATIVES = (("logits", "probs"), ("gate_logits", "gate"), ("scale_tril", "covariance_matrix", "precision_matrix"))
@@ -87,7 +89,7 @@ UNITS: Mapping[str, Mapping[str, Affine]] = {
         ("Exponential Gamma GammaPoisson", {"rate": _rate}),
         ("InverseGamma Poisson ZeroInflatedPoisson", {"rate": _scale}),
         ("NegativeBinomial ZeroInflatedNegativeBinomial", {"logits": _logarithm}),
-        ("LogNormal", {"loc": _logarithm}),
+        ("HurdleLogNormal LogNormal", {"loc": _logarithm}),
         ("LowRankMultivariateNormal", {"loc": _location, "cov_factor": _rows, "cov_diag": _square}),
         ("MultivariateNormal", {"loc": _location, "scale_tril": _rows}),
     )
@@ -154,8 +156,8 @@ OPEN: Mapping[type[Distribution], Any] = {
 Torch declares these supports with their boundary.
 """
 
-PLAIN = {"Bernoulli", "Categorical", "Cauchy", "Delta", "Exponential", "HalfCauchy", "HalfNormal", "Laplace"}
-PLAIN |= {"LogNormal", "Normal", "OneHotCategorical", "Uniform", "VonMises"}
+PLAIN = {"Bernoulli", "Categorical", "Cauchy", "Delta", "Exponential", "HalfCauchy", "HalfNormal", "HurdleLogNormal"}
+PLAIN |= {"Laplace", "LogNormal", "Normal", "OneHotCategorical", "Uniform", "VonMises"}
 """Names of the distributions whose log density is accurate in float32, because no large terms cancel.
 
 The log densities of all other distributions are computed in float64.
@@ -171,8 +173,8 @@ class Family:
     be given.
 
     Args:
-        distribution: name of a class in `pyro.distributions`, such as "Poisson", or a distribution class. A model with
-            a class cannot be stored in a run directory.
+        distribution: "HurdleLogNormal", name of a class in `pyro.distributions`, such as "Poisson", or a distribution
+            class. A model with a class cannot be stored in a run directory.
         given: values of fixed parameters by name, such as {"total_count": 12}.
         learned: names of parameters that are learned and do not depend on the features.
         shapes: shapes of parameters by name, for parameters of a vector distribution whose shape is not (D,) or (D, D);
@@ -209,10 +211,11 @@ class Family:
         """
         if not isinstance(self.distribution, str):
             return self.distribution
-        kind = vars(dist).get(self.distribution)
+        known = {**vars(dist), HurdleLogNormal.__name__: HurdleLogNormal}
+        kind = known.get(self.distribution)
         if isinstance(kind, type) and issubclass(kind, Distribution):
             return kind
-        names = [name for name, value in vars(dist).items() if isinstance(value, type)]
+        names = [name for name, value in known.items() if isinstance(value, type)]
         raise ValueError(f"Pyro has no distribution {self.distribution!r}{nearest(self.distribution, names)}")
 
     def build(self, shape: Shape) -> ConditionalDistribution:
@@ -524,6 +527,7 @@ FAMILIES: Mapping[str, DistributionSpec] = {
     "angle": Family("VonMises"),
     "positive": Family("Gamma"),
     "log-normal": Family("LogNormal"),
+    "hurdle": Family("HurdleLogNormal"),
     "power": Family("Exponential"),
     "share": Family("Beta"),
     "binary": Family("Bernoulli"),

@@ -98,6 +98,12 @@ class TriangularNormal(TorchDistribution):
         """Mean (..., D)."""
         return self.loc
 
+    @property
+    def variance(self) -> Tensor:
+        """Variance of each coordinate, (..., D)."""
+        identity = torch.eye(self.event_shape[0], dtype=self.loc.dtype, device=self.loc.device)
+        return torch.linalg.solve_triangular(self.whitening, identity, upper=False).square().sum(-1)
+
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Return reparameterised draws (*sample_shape, ..., D)."""
         shape = self._extended_shape(torch.Size(sample_shape))

@@ -20,6 +20,7 @@ from .geometry.skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, WALKER, Skelet
 from .geometry.views import Bones, Heading, Rotations
 from .scoring.criticism import draw_traversal, statistics
 from .scoring.metrics import several_futures
+from .scoring.published import frames_of, published_windows
 from .scoring.scores import displacements, scores
 from .scoring.truths import PseudoTruths, WithPseudoTruths
 from .segments.dataset import SegmentData
@@ -62,12 +63,14 @@ __all__ = [
     "draw_traversal",
     "estimate_angle_limits",
     "falls",
+    "frames_of",
     "gait_cycles",
     "generate",
     "interpolate",
     "is_forecasts",
     "latent_map",
     "occlude",
+    "published_windows",
     "read_motion",
     "read_paths",
     "reconstruct_segments",

@@ -201,6 +201,7 @@ class AttentionNetwork(Network):
         super().__init__(inputs, local, spec.width)
         self.heads, self.start_is_visible = spec.heads, spec.start
         self.sinusoids = local and spec.positions == "sinusoids"
+        self.stationary = not self.sinusoids
         self.extractors = Extractors(self.inputs, spec.extract, spec.activation)
         self.points: list[tuple[Input, int | None]] = []
         self.ranged: list[Input] = []

@@ -61,6 +61,10 @@ class Network(nn.Module):
 
     head: ClassVar[Any] = None
     """Class of the factor's distribution specification, if only this class can use the features; otherwise None."""
+    stationary: bool = False
+    """Whether features depend on values at fixed lags alone, not on the step itself."""
+    streams: bool = False
+    """Whether a loop may run without end: `stationary`, and the state of `step` does not grow with the steps."""
 
     def __init__(self, inputs: Sequence[Input], local: bool, features: int):
         super().__init__()

@@ -73,7 +73,7 @@ class WithNoiseNetwork(Network):
 
     def __init__(self, inner: Any, inputs: Sequence[Input], scale: Input, local: bool):
         super().__init__(inputs, local, inner.features + scale.size)
-        self.inner, self.name = inner, scale.name
+        self.inner, self.name, self.stationary = inner, scale.name, inner.stationary
 
     def _without_scale(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {name: value for name, value in values.items() if name != self.name}

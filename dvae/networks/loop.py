@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from copy import copy
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -30,6 +31,9 @@ class Rows(Sequence[Any]):
         self.written = [0] * len(values)
         self.moves: list[Tensor] = []
         self.origin: Tensor | None = None  # composition of all moves, which selects hoisted work in one step
+        self.is_history = all(
+            value is None for value in self.values
+        )  # of draws, rather than of work done before a loop
 
     def select(self, rows: Tensor) -> Rows:
         """Return the sequence for the batch rows with indices (N,), without copying any tensor."""
@@ -37,7 +41,22 @@ class Rows(Sequence[Any]):
         selected.written = list(self.written)
         selected.moves = [*self.moves, rows]
         selected.origin = rows if self.origin is None else self.origin.index_select(0, rows)
+        selected.is_history = self.is_history
         return selected
+
+    def slide(self) -> None:
+        """Forget the first step of a history, whose other steps move forward, and the selections of rows so far."""
+        self.values = [self[t] for t in range(len(self))]
+        if self.is_history:
+            self.values = [*self.values[1:], None]
+        self.written, self.moves, self.origin = [0] * len(self), [], None
+
+    def replaced(self, t: int, value: Any) -> Rows:
+        """Return a copy with another value at step t."""
+        copied = copy(self)
+        copied.values, copied.written = list(self.values), list(self.written)
+        copied[t] = value
+        return copied
 
     def __getitem__(self, t: Any) -> Any:
         value, since = self.values[t], self.written[t]
@@ -90,6 +109,27 @@ def select(state: Any, rows: Tensor) -> Any:
     if is_dataclass(state) and not isinstance(state, type) and not state.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         return replace(state, **{f.name: select(getattr(state, f.name), rows) for f in fields(state)})
     return state
+
+
+def slide(state: Any) -> None:
+    """Forget the first step of all histories in a loop's state, in place (`Rows.slide`).
+
+    A loop without end keeps the last steps alone, and calls `step` with the same position t again and again.
+    """
+    if isinstance(state, Rows):
+        state.slide()
+        return
+    kind = type(state)
+    if kind in (list, tuple):
+        parts = state
+    elif kind is dict:
+        parts = state.values()
+    elif is_dataclass(kind) and not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        parts = vars(state).values()
+    else:
+        return
+    for part in parts:
+        slide(part)
 
 
 Computed = TypeVar("Computed")

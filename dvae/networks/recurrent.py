@@ -277,6 +277,8 @@ def lstm_cell(gates: Tensor, hidden: tuple[Tensor, Tensor], layer: Any) -> tuple
 class RecurrentNetwork(Network):
     """Network of `Recurrent`."""
 
+    stationary = streams = True
+
     def __init__(self, spec: Recurrent, inputs: Sequence[Input], local: bool):
         super().__init__(inputs, local, 0)
         self.extractors = Extractors(self.inputs, spec.extract, spec.activation)

@@ -232,6 +232,7 @@ class LinearSDENetwork(Network):
     """
 
     head = Triangular
+    stationary = True
 
     def __init__(self, inputs: Sequence[Input], before: Input, gap: str, times: tuple[float, float]):
         super().__init__(inputs, True, before.size + before.size**2)

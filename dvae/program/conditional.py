@@ -360,7 +360,7 @@ class Conditional(nn.Module):
         # these are read from the draws, even if given
         child = self.factor.child if self.head.residual and self._output_units is not None else None
         live = [name for name in self.units if name in self.parents and (name not in parents or name == child)]
-        factors = self._factors(parents)
+        factors = self._factors(parents) if self.exposure is None or self.exposure[0] in parents else None
         if not live and factors is None:
             return state
         return Standardised(state, {name: Rows([None] * length) for name in live}, lengths, factors)
@@ -389,6 +389,8 @@ class Conditional(nn.Module):
                 (samples if self._output_units is None else inputs)[self.factor.child], t - 1, features, self.size
             )
         factors = state.factors[:, t] if isinstance(state, Standardised) and state.factors is not None else None
+        if factors is None and self.exposure is not None:
+            factors = samples[self.exposure[0]][t].exp()
         return self._rescale(self.head(features, previous, t), factors), self._with_network_state(state, inner)
 
     def forward_chunk(
@@ -416,12 +418,22 @@ class Conditional(nn.Module):
 
     def _standardise_draws(self, state: Any, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Any, Mapping[str, Any]]:
         """Return the state of the network, and the draws standardised as the network reads them."""
-        if not isinstance(state, Standardised):
-            return state, samples
-        standardised = {
-            n: extend_features(rows, samples[n], self.units[n], state.lengths) for n, rows in state.kept.items()
-        }
-        return state.network, {**samples, **standardised}
+        if isinstance(state, Standardised):
+            standardised = {
+                n: extend_features(rows, samples[n], self.units[n], state.lengths) for n, rows in state.kept.items()
+            }
+            state, samples = state.network, {**samples, **standardised}
+        indicated = {n: self._indicated(samples, n) for n in self.indicators if n in samples}
+        return state, {**samples, **indicated} if indicated else samples
+
+    @staticmethod
+    def _indicated(samples: Mapping[str, Sequence[Tensor]], name: str) -> list[Any]:
+        """Return draws with indicators of observed entries appended; a complete step has no mask."""
+        masks, steps = samples[indicator(name)], list(samples[name])
+        for s, value in enumerate(steps):
+            if value is not None:
+                steps[s] = torch.cat([value, torch.ones_like(value) if masks[s] is None else masks[s].to(value)], -1)
+        return steps
 
     def select(self, state: Any, rows: Tensor) -> Any:
         """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles."""

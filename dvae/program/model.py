@@ -8,6 +8,7 @@ the same program with different given values.
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -38,6 +39,7 @@ from ..options import Range, kind_of, problem
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
 from .enumeration import Discrete, EnumerationPlan
+from .filtering import Filter
 from .forecast import forecast, impute, reconstruct, states
 from .rollout import InputNoise, Rollout, ScheduledSampling
 
@@ -572,6 +574,51 @@ class DynamicalVAE(nn.Module):
         """
         with self.running():
             return forecast(self, batch, horizon, samples, draw_emission, fix, chunk)
+
+    def filter(
+        self,
+        batch: AnyBatch | None = None,
+        particles: int | None = None,
+        *,
+        lag: int = 0,
+        resample_below: float = 0.5,
+        seed: int | None = None,
+        resume: str | os.PathLike[str] | None = None,
+    ) -> Filter:
+        """Filter sequences online: distributions of latents given the data so far, and of each step given earlier ones.
+
+        The result has the results of all given steps, `filtered`; `update` continues with new steps, and `predict`
+        returns the distribution of the next one. Discrete latents are summed out exactly. Other latents have weighted
+        particles, which are resampled as in `fivo_bound`: the sum of the log evidences is that bound. The guide
+        proposes the particles unless it reads later data; then the generative distribution does
+        (`Filtered.proposal`).
+
+        Args:
+            batch: first steps, as in `model`, complete, ragged or with a mask.
+            particles: K, number of particles; None for the exact filter of a linear-Gaussian model, and 100 particles
+                for other models with continuous latents.
+            lag: L of fixed-lag smoothing, the distribution of z_{t-L} given the data up to t.
+            resample_below: share of K; particles are resampled before a step if the effective sample size is below it.
+            seed: seed of all random numbers of the filter.
+            resume: file of `Filter.save`, which replaces all other arguments.
+
+        Raises:
+            ValueError: the batch or an argument is invalid, or the model cannot be filtered, such as one whose
+                likelihood reads latents after t.
+
+        Example:
+            >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2})
+            >>> stream = model.filter(torch.randn(3, 4, 2), particles=16)
+            >>> stream.update(torch.randn(3, 2)).log_evidence.shape
+            torch.Size([3, 1])
+        """
+        if resume is None:
+            if batch is None:
+                raise ValueError("filter needs the first steps of the data, or resume= with the file of a filter")
+            return Filter(self, batch, particles, lag, resample_below, seed)
+        if batch is not None or particles is not None or seed is not None:
+            raise ValueError("resume= restores a filter with its data and particles; leave out the other arguments")
+        return Filter.load(self, resume)
 
     @torch.no_grad()
     def reconstruct(self, batch: AnyBatch, samples: int = 1, *, chunk: int = CHUNK) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from .protocol import Cut
 SPIKE, REPEATS = 0.05, 20
 """Share and number of equal values that are a spike; REPEATS is also the minimum number of compared rows."""
 HURDLE = 0.3
-"""Share of equal values above which a column of its own for them is proposed too."""
+"""Share of equal values above which a family or a column of its own for them is proposed too."""
 ALIGNED = 0.5
 """Share of the pairs of a sequence and a date that have a row, above which sequences have the same dates."""
 YEARS = (1500, 2500)
@@ -78,7 +78,11 @@ def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
         share, level, unit = counts.max() / counts.sum(), levels[counts.argmax()], _resolution(levels)
         remedies = [f"rounding = {unit:g}"] if unit else []
         remedies += ["the family sparse-overdispersed"] if unit == 1 and levels[0] == level == 0 else []
-        remedies += [] if unit and share < HURDLE else ["one binary column for it, and another that is empty there"]
+        if not unit or share >= HURDLE:
+            is_hurdle = levels[0] == level == 0 and unit != 1  # positive whole numbers repeat, too
+            remedies += [
+                "the family hurdle" if is_hurdle else "one binary column for it, and another that is empty there"
+            ]
         if share > SPIKE and counts.max() >= REPEATS:
             spikes.append(f"{share:.0%} of {column.name!r} are {level:g} ({' or '.join(remedies)})")
     if spikes:

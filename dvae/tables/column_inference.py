@@ -84,6 +84,7 @@ class ColumnHints:
         na_values: texts or numbers that mark missing values, in addition to empty cells and NaN.
         decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
         calendar: covariates computed from the time, of `dvae.tables.calendar.FEATURES`.
+        lags: numbers of steps back to earlier values of the targets, which are covariates too.
     """
 
     columns: tuple[str, ...] = ()
@@ -98,6 +99,7 @@ class ColumnHints:
     na_values: tuple[str, ...] = ()
     decimal: str | None = None
     calendar: tuple[str, ...] = ()
+    lags: tuple[int, ...] = ()
 
     def of(self, frame: Any) -> Columns:
         """Return the schema of a frame; entries that are not given are inferred, as in `infer_columns`.
@@ -154,6 +156,7 @@ class ColumnHints:
             tuple(dict.fromkeys((*self.na_values, *marks))),
             self.decimal,
             self.calendar,
+            self.lags,
         )
         for column in numbers:
             if column_marks := inference.numbers[column.name].marks:

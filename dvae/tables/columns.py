@@ -5,6 +5,7 @@ time = "date"                         # or ["date", "hour"], which are joined
 zone = "Europe/Berlin"                # time zone, if the times do not name it
 na_values = ["?"]                     # mark missing values
 calendar = ["weekday", "month"]       # covariates computed from the time: hour, weekday, month, day_of_year
+lags = [28, 365]                      # covariates: earlier values of the targets, at or above the horizon
 group = "region"                      # group of each sequence, for panels
 split = "part"                        # train, validation or test, if the data define it
 
@@ -133,10 +134,12 @@ class Columns:
         decimal: "." or ",", the decimal sign of numbers in text; None to infer it.
         calendar: covariates that are computed from the time, of `dvae.tables.calendar.FEATURES`. They are known in the
             future. Any other calendar, such as holidays, is a column with the role "known".
+        lags: numbers of steps back to earlier values of the targets, which models read as covariates. At or above the
+            horizon, they are known in the future.
 
     Raises:
         ValueError: if two columns share a name, no column is a target, the zone is unknown or given without a time, or
-            the decimal sign or a calendar feature is invalid.
+            the decimal sign, a calendar feature or a lag is invalid.
     """
 
     columns: tuple[Column, ...]
@@ -148,6 +151,7 @@ class Columns:
     na_values: tuple[str, ...] = field(default=(), repr=False)
     decimal: str | None = field(default=None, repr=False)
     calendar: tuple[str, ...] = field(default=(), repr=False)
+    lags: tuple[int, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         for name in self.calendar:
@@ -156,6 +160,8 @@ class Columns:
                     f"calendar is {', '.join(self.calendar)}; expected some of {', '.join(FEATURES)}, each at most once"
                     f"{nearest(name, FEATURES)}"
                 )
+        if len({*self.lags}) < len(self.lags) or any(lag < 1 for lag in self.lags):
+            raise ValueError(f"lags are {', '.join(map(str, self.lags))}; expected different numbers of steps, from 1")
         if not isinstance(self.time, str | None):
             time = tuple(self.time)
             object.__setattr__(self, "time", time if len(time) > 1 else (*time, None)[0])
@@ -244,7 +250,7 @@ class Columns:
         entries: dict[str, Any] = {"id": list(self.id), "time": time, "group": self.group, "split": self.split}
         # fingerprints of windows hash these entries: default values stay out
         entries |= {name: value for name in ("zone", "decimal") if (value := getattr(self, name))}
-        entries |= {name: list(value) for name in ("na_values", "calendar") if (value := getattr(self, name))}
+        entries |= {name: list(value) for name in ("na_values", "calendar", "lags") if (value := getattr(self, name))}
         columns = {}
         for column in self.columns:
             values = {entry.name: getattr(column, entry.name) for entry in fields(Column) if entry.name != "name"}
@@ -281,6 +287,7 @@ class Columns:
             for name in ("id", "time", "zone", "group", "split", "na_values", "decimal", "calendar")
             if (value := getattr(self, name))
         ]
+        lines += [f"lags = [{', '.join(map(str, self.lags))}]"] if self.lags else []
         for column in self.columns:
             bare = re.fullmatch(r"[A-Za-z0-9_-]+", column.name)
             lines += ["", f"[columns.{column.name if bare else _quote(column.name)}]"]
@@ -331,7 +338,11 @@ def layout(schema: Mapping[str, Any]) -> dict[str, Any]:
         many = isinstance(value, list | tuple)
         items = tuple(value) if many else (value,)
         lists = ("id", "na_values", "calendar")
-        if (name == "time" and many) or name in lists:
+        if name == "lags":
+            if not (many and all(isinstance(item, int) and not isinstance(item, bool) for item in items)):
+                raise ValueError(f"lags is {brief(value)}; expected numbers of steps, such as [7, 14]")
+            entries[name] = items
+        elif (name == "time" and many) or name in lists:
             if not all(isinstance(item, str) for item in items):
                 expected = {"na_values": 'texts, such as ["?"]', "calendar": 'features, such as ["weekday"]'}.get(
                     name, "names of columns"

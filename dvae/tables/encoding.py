@@ -8,7 +8,10 @@
 | d | time since the previous step in median steps, if steps are not evenly spaced | (B, T, 1) |
 | r | logarithm of the level of each count: its mean over earlier observed steps, shrunk to the panel's | (B, T, R) |
 
-c ends with the calendar features of the schema (`Calendar.features`), computed from the times.
+c ends with the calendar features of the schema (`Calendar.features`), computed from the times, and the values of the
+targets at each lag with their indicators. A lagged value is relative to the mean and standard deviation of the O steps
+up to it, so sequences of any level and scale are comparable; O is the number of observed steps. It is the logarithm of
+positive data, and of 1 + a count.
 
 A missing entry of a covariate repeats the last value, and its indicator is 0. Before any value, the entry is the mean
 of the training data, or no class for a category. A covariate known up to the present repeats its last value after that.
@@ -51,7 +54,7 @@ LEAST = 1e-7
 """Standard deviation of logarithms below which values count as constant up to rounding errors."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
 POSITIVE = ("positive", "log-normal")
-LOGARITHMIC = (*POSITIVE, "power")
+LOGARITHMIC = (*POSITIVE, "hurdle", "power")
 """Families whose logarithms networks read."""
 SCALED = (*LOGARITHMIC, *COUNTS)
 TargetUnits = Literal["columns", "logs", "series", "changes", "seasonal"]
@@ -121,6 +124,8 @@ class PanelSchema(Schema):
                 sizes[name] = sum(len(column.coordinates) for column in covariates) + n_indicators
         if self.columns.calendar:
             sizes[COVARIATES] = sizes.get(COVARIATES, 0) + sum(FEATURES[name] for name in self.columns.calendar)
+        if self.columns.lags:
+            sizes[COVARIATES] = sizes.get(COVARIATES, 0) + 2 * len(self.columns.lags) * sizes["x"]
         if self.step:
             sizes[GAPS] = 1
         if self.counts:
@@ -128,6 +133,11 @@ class PanelSchema(Schema):
         for name, value in (("sizes", sizes), ("length", self.cut.length), ("observed", self.cut.observed)):
             object.__setattr__(self, name, value)  # derived from the other fields
         super().__post_init__()
+        if short := [lag for lag in self.columns.lags if lag < (self.cut.horizon or 1)]:
+            raise ValueError(
+                f"lag {short[0]} is below the horizon {self.cut.horizon}, so its values are unknown at later steps of "
+                "a forecast; give lags at or above the horizon (models read the observed steps themselves)"
+            )
         for name, by_lag in self.priors.items():
             for lag, values in by_lag.items():
                 positive = values[1:2] if lag == "log" else (*values[1:4], *values[5:6])
@@ -210,6 +220,12 @@ class PanelSchema(Schema):
             step=step,
             calendar=panel.calendar,
         )
+
+    @property
+    @override
+    def preset(self) -> str:
+        """ "table" if forecasts have a horizon, which can select the weights."""
+        return "" if self.cut.observed is None else "table"
 
     @property
     def protocol(self) -> Cut:
@@ -386,7 +402,25 @@ class PanelSchema(Schema):
         if self.columns.calendar:
             assert one.times is not None  # checked by the panel
             parts.append(self.calendar.features(one.times, self.columns.calendar))
-        return np.concatenate(parts, 1)
+        return np.concatenate([*parts, *self._lagged(one)], 1)
+
+    def _lagged(self, one: Series) -> list[np.ndarray]:
+        """Return the relative values of the targets and their indicators (T, 2 D) at each lag."""
+        if not self.columns.lags:
+            return []
+        import pandas as pd  # slow to import
+
+        families = [column.family for column in self.columns.targets for _ in column.coordinates]
+        x = pd.DataFrame(np.array(self.targets(one), np.float64))
+        for index, family in enumerate(families):
+            if family in COUNTS:
+                x[index] = np.log1p(x[index])
+            elif family in POSITIVE:
+                x[index] = np.log(x[index])
+        recent = x.rolling(self.cut.observed or len(x), min_periods=1)
+        relative = ((x - recent.mean()) / recent.std(ddof=0).where(lambda scale: scale > 0, np.inf)).fillna(0.0)
+        both = pd.concat([relative, x.notna().astype(float)], axis=1)
+        return [both.shift(lag, fill_value=0.0).to_numpy() for lag in self.columns.lags]
 
     def static(self, one: Series) -> np.ndarray:
         """Return s (S,) of a sequence.

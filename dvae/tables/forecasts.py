@@ -237,10 +237,13 @@ def _quantile(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
     """Return quantiles of draws (K, ...) at mean ranks k / (K + 1).
 
     With these ranks, intervals contain exchangeable values at their nominal level, as in `metrics.coverage`. NumPy's
-    default ranks (k - 1) / (K - 1) span only the range of the draws, and its intervals are too narrow.
+    default ranks (k - 1) / (K - 1) span only the range of the draws, and its intervals are too narrow. Quantiles of
+    whole numbers are rounded outwards (and the median down), to possible values that keep the level of intervals.
     """
     quantiles: np.ndarray = np.quantile(draws, levels, axis=0, method="weibull")
-    return quantiles
+    is_upper = np.reshape(np.array(levels) > 0.5, (-1,) + (1,) * (draws.ndim - 1))
+    is_whole = (draws % 1 == 0).all(0)
+    return np.where(is_whole, np.where(is_upper, np.ceil(quantiles), np.floor(quantiles)), quantiles)
 
 
 def _save(result: PanelForecasts | PanelImputed, path: str | os.PathLike[str], **arrays: np.ndarray) -> None:

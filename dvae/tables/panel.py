@@ -358,7 +358,7 @@ def _validity_test(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], 
         "binary": (lambda v: (v == 0) | (v == 1), "0 or 1"),
         **dict.fromkeys(COUNTS, (_counts, "whole numbers from 0")),
         **dict.fromkeys(("positive", "log-normal"), (lambda v: v > 0, "numbers above 0")),
-        "power": (lambda v: v >= 0, "numbers from 0"),
+        **dict.fromkeys(("hurdle", "power"), (lambda v: v >= 0, "numbers from 0")),
         "share": (lambda v: (v > 0) & (v < 1), "numbers above 0 and below 1"),
         "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
     }

@@ -15,12 +15,10 @@ from __future__ import annotations
 
 import codecs
 import csv
-import math
 import os
 import re
 import textwrap
 import warnings
-import zipfile
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, fields
@@ -33,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from .. import files
-from ..data.npy import mapped
+from ..data.npy import NpyError, mapped, npz_arrays
 from ..distributions.family import FAMILIES
 from ..options import nearest
 from .column_inference import ColumnHints
@@ -239,13 +237,19 @@ def _read_npz(path: Path, content: bytes) -> Any:
     """Return an npz as a frame."""
     import pandas as pd
 
-    arrays = _arrays(path, content)
-    name = "x" if "x" in arrays else next(iter(arrays))
+    try:
+        arrays = npz_arrays(BytesIO(content), LARGEST, ("x", "lengths"))
+    except NpyError as error:
+        raise ValueError(f"{path} {error}") from error
+    name = next((name for name in ("x", *arrays) if name in arrays and name != "lengths"), None)
+    if name is None:
+        raise ValueError(f"{path} must have an array 'x', or a single array")
     values = arrays[name]
     if values.ndim not in (2, 3) or values.dtype.kind not in "fiub" or not values.size:
         raise ValueError(
             f"{name!r} of {path} is {values.dtype} {values.shape}; expected numbers (sequences, steps, columns)"
         )
+    _refuse_large(8 * values.size)
     values = values if values.ndim == 3 else values[None]
     if values.shape[2] > MOST:
         raise ValueError(f"{name!r} of {path} has {values.shape[2]} columns; at most {MOST} are read")
@@ -328,37 +332,6 @@ def _files(root: Path) -> Iterator[Path]:
 def is_domain(name: str) -> bool:
     """Return whether a path is a name of `dvae.tables.domains` and not an existing file."""
     return name in DOMAINS and not Path(name).exists()
-
-
-def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
-    try:
-        with zipfile.ZipFile(BytesIO(content)) as archive:
-            if (size := sum(entry.file_size for entry in archive.infolist())) > LARGEST:
-                raise ValueError(f"it holds {size} bytes; at most {LARGEST} are read")
-            entries = archive.namelist()
-            for entry in entries if len(entries) == 1 else {"x.npy", "lengths.npy"}.intersection(entries):
-                with archive.open(entry) as member:
-                    _check_header(entry, member)
-        with np.load(BytesIO(content), allow_pickle=False) as npz:
-            arrays = {name: npz[name] for name in npz.files if name in ("x", "lengths") or len(npz.files) == 1}
-    except Exception as error:
-        raise ValueError(f"{path} cannot be read as npz: {str(error)[:300]}") from error
-    if not set(arrays) - {"lengths"}:
-        raise ValueError(
-            f"{path} holds {', '.join(npz.files[:20]) or 'nothing'}; expected an array 'x', or a single array"
-        )
-    return arrays
-
-
-def _check_header(name: str, member: Any) -> None:
-    """Check the size of an array before memory is allocated."""
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    version = np.lib.format.read_magic(member)
-    if version not in readers:
-        raise ValueError(f"{name} is not an array of numbers")
-    shape, _, _ = readers[version](member)
-    if 8 * math.prod(shape) > LARGEST:
-        raise ValueError(f"{name} is {shape}; at most {LARGEST // 8} numbers are read")
 
 
 def schema_beside(path: str | os.PathLike[str]) -> tuple[Columns | ColumnHints | None, Cut | None]:

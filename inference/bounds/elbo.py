@@ -470,15 +470,24 @@ def importance_mean(
         chunk: largest number of sequences times particles in memory.
         groups: groups of sequences that share latents.
     """
-    at_once = max(1, min(particles, chunk // size))
-    counts = [min(at_once, particles - first) for first in range(0, particles, at_once)]
-    log_weights = torch.cat([log_weights_of(count).unflatten(0, (count, size)) for count in counts])
+    log_weights = _all_weights(log_weights_of, size, particles, chunk)
     if groups is not None:
         log_weights = groups.summed(log_weights)
     bound, khat = log_weights.logsumexp(0) - math.log(particles), _khat(log_weights)
     if groups is not None:
         bound, khat = groups.split_evenly(bound), khat[groups.place]
     return IWAEBound(bound, khat, particles)
+
+
+def importance_weights(model: DynamicalVAE, data: AnyBatch, size: int, particles: int, chunk: int) -> Tensor:
+    """Return K log weights log p(x, z) - log q(z | x) of each of B sequences, (K, B)."""
+    return _all_weights(partial(_repeated_weights, model, data, {}), size, particles, chunk)
+
+
+def _all_weights(log_weights_of: Callable[[int], Tensor], size: int, particles: int, chunk: int) -> Tensor:
+    at_once = max(1, min(particles, chunk // size))
+    counts = [min(at_once, particles - first) for first in range(0, particles, at_once)]
+    return torch.cat([log_weights_of(count).unflatten(0, (count, size)) for count in counts])
 
 
 def _repeated_weights(model: DynamicalVAE, data: AnyBatch, options: Mapping[str, Any], count: int) -> Tensor:

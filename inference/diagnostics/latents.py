@@ -67,14 +67,7 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
     """
     require_densities(model)
     require_latents(model)
-    for name in model.latents:
-        conditional = model.generator[name]
-        if conditional.support is not None or conditional.head.deterministic:
-            raise ValueError(
-                f"the distribution of {conditional.factor} restricts the values of the latent {name}, but "
-                "gradient-based sampling requires latents on the whole real line; "
-                "use a distribution such as distributions.Normal()"
-            )
+    require_real(model)
     data = model.read(batch)
     if model.grouped and data.group is not None:
         raise ValueError("sequences of a group have one joint posterior; remove 'group' from the batch")
@@ -83,6 +76,22 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
     if not indices or not set(indices) <= set(range(size)):
         raise ValueError(f"sequences must be some of 0 to {size - 1}, the rows of the batch; got {list(indices)}")
     return [rows(data, slice(index, index + 1)) for index in indices]
+
+
+def require_real(model: DynamicalVAE) -> None:
+    """Refuse latents that cannot take every real value, which gradient-based sampling requires.
+
+    Raises:
+        ValueError: when the model has such a latent.
+    """
+    for name in model.latents:
+        conditional = model.generator[name]
+        if conditional.support is not None or conditional.head.deterministic:
+            raise ValueError(
+                f"the distribution of {conditional.factor} restricts the values of the latent {name}, but "
+                "gradient-based sampling requires latents on the whole real line; "
+                "use a distribution such as distributions.Normal()"
+            )
 
 
 class Inferred:

@@ -426,7 +426,8 @@ def reference_posterior(
                 continue
             nuts_draws, divergences, evaluations = _nuts(inferred, draws, chains, warmup, partial(bar.advance, task))
             references.append(_moments(inferred, nuts_draws))
-            diagnostics.append((*_diagnose(inferred, nuts_draws), divergences, evaluations))
+            measured = (inferred.whole(torch.as_tensor(each)).numpy() for each in diagnose(nuts_draws))
+            diagnostics.append((*measured, divergences, evaluations))
     sampling = None
     if diagnostics:
         rhat, effective, diverged, evaluated = map(np.array, zip(*diagnostics, strict=True))
@@ -508,15 +509,15 @@ def _moments(inferred: Inferred, draws: Tensor) -> LatentMoments:
     return LatentMoments(mean, spread, across.numpy(), *within)
 
 
-def _diagnose(inferred: Inferred, draws: Tensor) -> Iterator[np.ndarray]:
-    """Yield R-hat and effective draws of the bulk (Q,) of draws (C, N, P); 1000 and 0 for constant chains."""
+def diagnose(draws: Tensor) -> Iterator[np.ndarray]:
+    """Yield R-hat and effective draws of the bulk (P,) of draws (C, N, P); 1000 and 0 for constant chains."""
     from arviz_stats.base import array_stats
 
     for measure in (array_stats.rhat, array_stats.ess):
         with np.errstate(divide="ignore", invalid="ignore"):
             values = measure(draws.double().cpu().numpy(), chain_axis=0, draw_axis=1)
         fallback = 1000.0 if measure is array_stats.rhat else 0.0
-        yield inferred.whole(torch.as_tensor(np.nan_to_num(values, nan=fallback, posinf=fallback))).numpy()
+        yield np.nan_to_num(values, nan=fallback, posinf=fallback)
 
 
 def _stack(parts: Sequence[LatentMoments]) -> LatentMoments:

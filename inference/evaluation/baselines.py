@@ -141,7 +141,7 @@ class Scale:
         y = torch.where(self.which(*POSITIVE), y.exp(), y)
         y = torch.where(self.which("share"), y.sigmoid(), y)
         y = torch.where(self.which("angle"), torch.remainder(y + torch.pi, 2 * torch.pi) - torch.pi, y)
-        y = torch.where(self.which("power", *COUNTS), y.clamp(min=0), y)
+        y = torch.where(self.which("hurdle", "power", *COUNTS), y.clamp(min=0), y)
         return torch.where(self.which(*COUNTS), y.round(), y)
 
 

@@ -8,6 +8,7 @@ uncertainty of their differences.
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -17,13 +18,17 @@ from torch import Tensor, nn
 
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, Listed, axis_names, cluster_keys, sequences, take_split
+from ...options import Count, require
 from ...program.model import DynamicalVAE
-from ..bounds.elbo import bound_notes, require_likelihood
+from ..bounds.elbo import bound_notes, require_densities, require_likelihood
+from ..bounds.leave_future_out import LeaveFutureOut, mixture
+from ..bounds.leave_future_out import leave_future_out as left_out_densities
 from ..bounds.particles import obstacle
 from ..bounds.teacher_forced import bounds, filtered, information, length_of, variances
 from .comparison import Comparison, ModelResult
+from .ensemble import Ensemble, require_same
 from .evaluate import evaluate
-from .evaluation_windows import on_device_of, seeded_evaluation
+from .evaluation_windows import on_device_of, refuse_non_finite, seeded_evaluation
 from .record import plain
 from .result import progress_bar
 from .scores import Measure, Scores, proper
@@ -32,13 +37,14 @@ _PAIRS = 4096  # largest number of sequences times contrasts in memory
 
 
 def compare(
-    models: Mapping[str, DynamicalVAE | Sequence[DynamicalVAE]],
+    models: Mapping[str, DynamicalVAE | Sequence[DynamicalVAE] | Ensemble],
     data: HeldOutWindows | Listed | Tensor | np.ndarray | Batch,
     *,
     scores: Scores = proper,
     particles: int = 100,
     estimates: int = 1,
     filter_particles: int = 0,
+    leave_future_out: tuple[int, int] | None = None,
     contrasts: int = 128,
     samples: int = 50,
     draw_emission: bool | None = None,
@@ -76,7 +82,8 @@ def compare(
     below log M.
 
     Args:
-        models: a model by name, or several that differ only in their training seed.
+        models: a model by name, or several that differ only in their training seed. An `Ensemble` is one row, of the
+            bounds and forecasts of its mixture, with the largest k-hat of its models.
         data: windows (such as `ArrayWindows`), x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
         scores: scores of forecasts, as in `evaluate`.
         particles: K of the IWAE bound. k-hat needs 25, and 100 or more to be meaningful for single sequences.
@@ -84,6 +91,9 @@ def compare(
             mean. `Comparison.to_arviz` needs 25 or more.
         filter_particles: K of the FIVO bound (`fivo_bound`); 0 omits it. For a model without a FIVO bound, such as
             one with a backward guide, a note gives the reason.
+        leave_future_out: (L, M) to add "LFO", the log density of each M steps given all earlier ones, from L observed
+            steps on (module `leave_future_out`), with K particles for each of its estimates. The bound compares models
+            by evidence, LFO by forecasts.
         contrasts: M, number of randomly drawn sequences among which information is measured; all sequences if there are
             fewer. 0 omits information.
         samples: number of forecasts per window for the free-running scores, which take longest; 0 omits them. Tensors,
@@ -115,12 +125,14 @@ def compare(
             "particles, estimates and batch_size must be at least 1, filter_particles, contrasts and samples at least "
             f"0, got {particles}, {estimates}, {batch_size}, {filter_particles}, {contrasts} and {samples}"
         )
+    require(tuple[Count, Count] | None, leave_future_out=leave_future_out)
     data = take_split(data, "test")
     windows = data if isinstance(data, HeldOutWindows) else None
     is_whole = windows is not None and windows.protocol.observed is None
     samples = 0 if windows is None or is_whole else samples
     contenders = _contenders(models)
     labelled = {label: model for label, _, model in _each(contenders)}
+    mixtures = {name: value for name, value in models.items() if isinstance(value, Ensemble)}
     labels: dict[str, str] = {}
     for label, model in labelled.items():
         labels.setdefault(model.view.measured or "the data", label)
@@ -135,29 +147,30 @@ def compare(
     keys = [("data", str(n), 0) for n in sequence_ids] if windows is None else cluster_keys(windows)
     contrast_indices = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]
     shared: dict[str, Any] = {"seed": seed, "batch_size": batch_size, "progress": progress}
-    free_running: dict[str, dict[str, Any]] = {label: {} for label in labelled}
+    free_running: dict[str, dict[str, Any]] = {label: {} for label in (*labelled, *mixtures)}
     measures: Sequence[Measure] = ()
     emission = "drawn" if draw_emission else "mean"
     if windows is not None and samples:
         forecast_options: dict[str, Any] = {"samples": samples, "draw_emission": draw_emission, "references": False}
         measures = [measure for measure in scores(windows) if measure.least <= samples and not measure.bins]
-        evaluation = evaluate(labelled, windows, scores=lambda _: measures, **forecast_options, **shared)
+        forecasters = {label: model for label, name, model in _each(contenders) if name not in mixtures} | mixtures
+        evaluation = evaluate(forecasters, windows, scores=lambda _: measures, **forecast_options, **shared)
         emission = evaluation.emission
-        free_running = {
+        free_running |= {
             label: {m.name: np.array(evaluation.rows[label].cluster_means[m.name]) for m in measures}
-            for label in labelled
+            for label in forecasters
         }
-    measured = {
-        label: _score_model(
-            label, model, batch, keys, contrast_indices, particles, estimates, filter_particles, **shared
-        )
-        | {"free_running": free_running[label]}
-        for label, model in labelled.items()
-    }
+    measured: dict[Any, dict[str, Any]] = {}
+    counts = particles, estimates, filter_particles, leave_future_out
+    for label, model in labelled.items():
+        if model not in measured:  # it may also be part of a mixture
+            measured[model] = _score_model(label, model, batch, keys, contrast_indices, *counts, **shared)
     rows = {}
     for name, versions in contenders.items():
-        seeds = [measured[label] for label, other, _ in _each(contenders) if other == name]
-        rows[name] = _contender(versions[0], seeds, dict((configs or {}).get(name, {})))
+        labels_of_row = [name] if name in mixtures else [label for label, row, _ in _each(contenders) if row == name]
+        scored, forecast = [measured[model] for model in versions], [free_running[label] for label in labels_of_row]
+        config = dict((configs or {}).get(name, {}))
+        rows[name] = _contender(versions[0], scored, forecast, config, name in mixtures)
     x = batch[next(iter(labelled.values())).observed[0]]
     return Comparison(
         rows=rows,
@@ -177,6 +190,9 @@ def compare(
         protocol=plain(dataclasses.asdict(windows.protocol)) if windows is not None else {},
         particles=particles,
         filter_particles=filter_particles,
+        leave_future_out=tuple(leave_future_out or ()),
+        n_forecast=_future_columns(next(iter(measured.values()))["left out"]).get("steps"),
+        mixtures={name: len(value.models) for name, value in mixtures.items()},
         contrasts=len(contrast_indices),
         samples=samples,
         emission=emission,
@@ -198,6 +214,7 @@ def _score_model(
     particles: int,
     estimates: int,
     filter_particles: int,
+    leave_future_out: tuple[int, int] | None,
     *,
     seed: int,
     batch_size: int,
@@ -210,9 +227,16 @@ def _score_model(
             for start in bar.track(range(0, count, size), description=f"{label}, {kind}"):
                 yield slice(start, start + size)
 
+        future: list[LeaveFutureOut] = []
+        if leave_future_out is not None:  # first, because it refuses some models
+            with seeded_evaluation(model, seed):
+                for part in parts("leave-future-out", len(keys), batch_size):
+                    rows = on_device_of(model, batch.rows(part))
+                    future.append(left_out_densities(model, rows, *leave_future_out, particles))
+                    refuse_non_finite(label, "leave-future-out density", future[-1].elpd.isfinite(), keys[part])
         with seeded_evaluation(model, seed):
             scores = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
-        scores["notes"] = list(bound_notes(label, model))
+        scores |= {"left out": future, "notes": list(bound_notes(label, model))}
         if filter_particles and (reason := obstacle(model, model.read(on_device_of(model, batch)))):
             scores["notes"].append(f"no FIVO bound: {reason}")
         elif filter_particles:
@@ -227,14 +251,47 @@ def _score_model(
     return scores
 
 
-def _contender(model: DynamicalVAE, seeds: Sequence[Mapping[str, Any]], config: dict[str, Any]) -> ModelResult:
-    """Return one model's row of the comparison from the scores of all its seeds; `model` is the model of any seed."""
-    excluded = {"steps", "notes"}
-    scores = _stack([{key: value for key, value in seed.items() if key not in excluded} for seed in seeds])
+def _contender(
+    model: DynamicalVAE,
+    seeds: Sequence[Mapping[str, Any]],
+    free_running: Sequence[Mapping[str, Any]],
+    config: dict[str, Any],
+    is_mixture: bool,
+) -> ModelResult:
+    """Return a row of the comparison from the scores of all seeds.
+
+    Args:
+        model: model of any seed.
+        seeds: teacher-forced scores of each seed.
+        free_running: scores of the forecasts of each seed; of the mixture alone if the seeds form one.
+        config: configuration given by the caller.
+        is_mixture: whether the row is an `Ensemble`.
+    """
+    future = [seed["left out"] for seed in seeds]
+    names = ("bounds", "kl_steps", "variances", "information", "estimates")
+    scores = _stack([{name: seed[name] for name in names} for seed in seeds])
+    if is_mixture:
+        bounds = {name: values for name, values in scores["bounds"].items() if name.endswith(("ELBO", "bound"))}
+        mixed = {name: np.logaddexp.reduce(values)[None] - math.log(len(seeds)) for name, values in bounds.items()}
+        scores = {name: {} for name in names} | {
+            "bounds": mixed | {"k-hat": scores["bounds"]["k-hat"].max(0, keepdims=True)},
+            "estimates": np.logaddexp.reduce(scores["estimates"])[None] - math.log(len(seeds)),
+        }
+        future = [[mixture(parts) for parts in zip(*future, strict=True)]]
+    columns = _stack([_future_columns(each) for each in future])
+    scores["bounds"] |= {name: values for name, values in columns.items() if name != "steps"}
     equations = {"generative": model.generative.text, "inference": model.inference.text}
-    return ModelResult(
-        equations, config, **{**scores, "estimates": scores["estimates"].mean(0)}, notes=seeds[0]["notes"]
-    )
+    scores["estimates"] = scores["estimates"].mean(0)
+    return ModelResult(equations, config, **scores, free_running=_stack(free_running), notes=seeds[0]["notes"])
+
+
+def _future_columns(parts: Sequence[LeaveFutureOut]) -> dict[str, np.ndarray]:
+    """Return density, Monte Carlo error, effective particles and forecast steps of N sequences, (N,) each."""
+    names = {"LFO": "elpd", "LFO error": "error", "LFO particles": "effective", "steps": "n_steps"}
+    return {
+        label: torch.cat([getattr(part, name) for part in parts]).double().cpu().numpy()
+        for label, name in (names if parts else {}).items()
+    }
 
 
 def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
@@ -246,28 +303,16 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
             raise TypeError(
                 f"{name!r} is a {type(value).__name__}; expected a DynamicalVAE, or a list of them, one for each seed"
             )
-    contenders: dict[str, list[Any]] = {
-        name: [value] if isinstance(value, nn.Module) else list(value) for name, value in models.items()
+    if not models:
+        raise ValueError("expected at least one row of models, got none")
+    contenders = {
+        name: list(value.models if isinstance(value, Ensemble) else [value] if isinstance(value, nn.Module) else value)
+        for name, value in models.items()
     }
-    if not contenders or not all(contenders.values()):
-        empty = next((name for name, versions in contenders.items() if not versions), None)
-        raise ValueError(
-            "expected at least one model in every row of models, got "
-            + (f"none in {empty!r}" if contenders else "no rows")
-        )
     for name, versions in contenders.items():
+        require_same(repr(name), versions)
         for version in versions:
-            if not isinstance(version, DynamicalVAE):
-                raise TypeError(f"{name!r} has a {type(version).__name__}; expected a DynamicalVAE for each seed")
-            require_likelihood(version)
-        first = versions[0]
-        for other in versions[1:]:
-            spec, other_spec = ((m.generative.text, m.inference.text, dict(m.sizes)) for m in (first, other))
-            if spec != other_spec:
-                raise ValueError(
-                    f"the models of {name!r} must differ only in their seed, but one is {spec} and another "
-                    f"{other_spec}; give them different names"
-                )
+            (require_densities if isinstance(models[name], Ensemble) else require_likelihood)(version)
     return contenders
 
 

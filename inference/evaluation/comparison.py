@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +17,7 @@ from typing_extensions import override
 from ...data.sequences import axis_names
 from ...options import nearest
 from ..bounds.elbo import KHAT_PARTICLES
+from ..bounds.leave_future_out import EFFECTIVE, REPLICATES
 from .estimates import Estimate, TwoWayErrors, number
 from .evaluation import ARROWS
 from .evaluation_windows import cluster_index
@@ -37,6 +38,9 @@ ACROSS = 6
 KHAT = 0.7
 """Pareto shape above which an IWAE bound is unreliable (Vehtari et al.)."""
 
+DIAGNOSTICS = ("k-hat", "LFO error", "LFO particles")
+"""Names of the diagnostics among the bounds."""
+
 _LOO_DRAWS = 25  # arviz_stats fits a Pareto tail to a fifth of the draws, and needs five
 
 
@@ -47,8 +51,9 @@ class ModelResult:
     Args:
         equations: "generative" and "inference".
         config: configuration given by the caller.
-        bounds: (S, N) each: "ELBO", "IWAE bound", "k-hat", "KL z" for every latent z, and "FIVO bound" if
-            computed; bounds in nats per sequence.
+        bounds: (S, N) each: "ELBO", "IWAE bound", "k-hat", "KL z" for every latent z, and "FIVO bound" and "LFO" if
+            computed, in nats per sequence. "LFO error" is the Monte Carlo error of "LFO", "LFO particles" their
+            effective sample size.
         kl_steps: mean KL over sequences by step, in nats, (S, T), of each local latent.
         variances: variance over the data of each coordinate's posterior mean, (S, D), of each latent.
         information: information of each latent, (S, T) in nats per step, or (S, 1) in nats per sequence if static.
@@ -113,6 +118,9 @@ class Comparison(Result):
         notes: lines below that table: how to read scores, or why they are missing.
         better: "lower", "higher" or "" for each score of that table.
         filter_particles: K of the FIVO bound; 0 if it was not computed.
+        leave_future_out: (L, M), numbers of observed and of forecast steps of "LFO"; empty if it was not computed.
+        n_forecast: number of forecast steps of all origins in every sequence, (N,).
+        mixtures: number of models of each row that is an `Ensemble`; it counts as one seed.
 
     Example:
         >>> pairs = {"filters": "q(z_t | z_{t-1}, x_{<=t})", "smooths": "q(z_t | z_{t-1}, x_{t:T})"}
@@ -137,10 +145,13 @@ class Comparison(Result):
     notes: list[str] = field(default_factory=list)
     better: dict[str, str] = field(default_factory=dict)
     filter_particles: int = 0
+    leave_future_out: tuple[int, ...] = ()
+    n_forecast: Annotated[np.ndarray, Dims("sequence")] | None = None
+    mixtures: dict[str, int] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> dict[str, Estimate]:
         row = self._row(name)
-        metrics = [metric for metric in row.bounds if metric != "k-hat"]
+        metrics = [metric for metric in row.bounds if metric not in DIAGNOSTICS]
         return {metric: self._parts(name, metric).estimate() for metric in (*metrics, *row.free_running)}
 
     @property
@@ -217,14 +228,16 @@ class Comparison(Result):
         Raises:
             ValueError: when sequences or settings differ, or both have a model of the same name.
         """
-        settings, other_settings = ({**vars(each), "rows": None, "n_steps": None} for each in (self, other))
+        of_rows = dict.fromkeys(("rows", "n_steps", "n_forecast", "mixtures"))
+        settings, other_settings = ({**vars(each), **of_rows} for each in (self, other))
         if different := [name for name, value in settings.items() if value != other_settings[name]]:
             raise ValueError(
                 f"comparisons to join may differ only in their models, but differ in {', '.join(different)}"
             )
         if shared := self.rows.keys() & other.rows.keys():
             raise ValueError(f"both comparisons have a model {', '.join(sorted(shared))}; rename one of them")
-        return dataclasses.replace(self, rows={**self.rows, **other.rows})
+        rows, mixtures = {**self.rows, **other.rows}, {**self.mixtures, **other.mixtures}
+        return dataclasses.replace(self, rows=rows, mixtures=mixtures)
 
     def table(self) -> Group:
         """Return three tables: bounds in the order of the ranking, use of the latents, free-running scores."""
@@ -312,6 +325,45 @@ class Comparison(Result):
         if panel.get_legend_handles_labels()[1]:
             panel.legend()
 
+    def monte_carlo_error(self, name: str) -> float:
+        """Return the Monte Carlo standard error of a model's mean "LFO", in nats per forecast step.
+
+        Raises:
+            KeyError: when the model was not compared.
+            ValueError: when there are no leave-future-out densities.
+        """
+        if self.n_forecast is None:
+            raise ValueError("no leave-future-out densities; compare again with leave_future_out=(L, M)")
+        error = self._row(name).bounds["LFO error"]
+        return float(np.sqrt((error**2).sum()) / len(error) / self.n_forecast.sum())
+
+    def to_elpd(self) -> dict[str, Any]:
+        """Return the leave-future-out densities as `{name: ELPDData}`, for `arviz_stats.compare`.
+
+        `elpd_i` is the sum over the origins of each sequence, in nats, as a mean over seeds, and `n_eff_i` is the
+        effective sample size of the particles. The standard error assumes independent sequences and ignores seeds; the
+        errors of `difference` are clustered. `p` is NaN, because no parameter was fitted to these sequences.
+
+        Raises:
+            ValueError: when there are no leave-future-out densities.
+        """
+        from arviz_stats.utils import ELPDData
+        from xarray import DataArray
+
+        results = {}
+        for name, row in self.rows.items():
+            self.monte_carlo_error(name)  # raises without densities
+            size, particles = len(self.keys), row.bounds["LFO particles"].min(0)
+            by_sequence, effective = (
+                DataArray(values, {"sequence": self.labels()["sequence"]}, ("sequence",))
+                for values in (row.bounds["LFO"].mean(0), particles)
+            )
+            total, error = float(by_sequence.sum()), float(by_sequence.std(ddof=1) * math.sqrt(size))
+            few, draws = bool((particles < EFFECTIVE).any()), self.particles * REPLICATES
+            arrays: Any = {"elpd_i": by_sequence, "n_eff_i": effective}
+            results[name] = ELPDData("lfo", total, error, math.nan, draws, size, "log", few, math.nan, **arrays)
+        return results
+
     def to_arviz(self) -> dict[str, Any]:
         """Return `{name: DataTree}` for `arviz_stats.compare` and `arviz_stats.loo`.
 
@@ -371,6 +423,8 @@ class Comparison(Result):
                 "difference_to_best": _scored(self.difference(name, ranking[0])),
                 "khat_above_0.7": row.unreliable,
                 "active_units": row.active_units,
+                **({"mixture_of": self.mixtures[name]} if name in self.mixtures else {}),
+                **({"LFO_monte_carlo_error": self.monte_carlo_error(name)} if self.leave_future_out else {}),
             }
             for name, row in self.rows.items()
         }
@@ -410,13 +464,14 @@ class Comparison(Result):
 
     def _parts(self, name: str, metric: str) -> TwoWayErrors:
         row = self._row(name)
-        if metric not in {*row.bounds, *row.free_running} - {"k-hat"}:
-            names = [each for each in (*row.bounds, *row.free_running) if each != "k-hat"]
+        names = [each for each in (*row.bounds, *row.free_running) if each not in DIAGNOSTICS]
+        if metric not in names:
             raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, names)}; it has {', '.join(names)}")
         places = cluster_index(self.keys).numpy()
         if metric in row.free_running:
             return TwoWayErrors.of(row.free_running[metric], np.bincount(places, weights=self.n_steps))
-        return TwoWayErrors.by_cluster(row.bounds[metric], self.n_steps, places)
+        weights = self.n_forecast if metric == "LFO" and self.n_forecast is not None else self.n_steps
+        return TwoWayErrors.by_cluster(row.bounds[metric], weights, places)
 
     # Tables
 
@@ -439,31 +494,52 @@ class Comparison(Result):
     def _bound_table(self) -> Table:
         unit, cluster, step = self._words
         clustered = "" if unit.endswith(cluster) else f" (clustered by {cluster})"
-        bounds = (f"IWAE bound ↑\nK = {self.particles}", "difference to the best", "95 % (df)", "ELBO ↑")
-        filters = [f"FIVO bound ↑\nK = {self.filter_particles}"] if self.filter_particles else []
-        table = _table(
-            f"{self._title()}\nteacher-forced, nats a {step}",
-            "\n".join(
-                [
-                    f"mean ± standard error over {unit}s{clustered} ± over seeds",
-                    "95 %: confidence interval from both errors (df: degrees of freedom of Student's t)",
-                    f"k-hat > {KHAT}: share of {unit}s whose IWAE bound is unreliable",
-                    *([] if self.samples else self.notes),
-                    *(f"{name}: {note}" for name, row in self.rows.items() for note in row.notes),
-                ]
-            ),
-            ("seeds", *bounds, *filters, f"k-hat\n> {KHAT}"),
-        )
-        ranking = self.ranking
-        for name in ranking:
-            row, scores = self.rows[name], self[name]
-            difference = self.difference(name, ranking[0])
-            behind = ["–", "–"] if name == ranking[0] else [str(difference), _interval(difference)]
-            share = "–" if math.isnan(row.unreliable) else f"{100 * row.unreliable:.1f} %"
-            means = (str(scores["IWAE bound"]), *behind, str(scores["ELBO"]))
-            filtered = [str(scores.get("FIVO bound", "–")) for _ in filters]
-            table.add_row(name, str(row.seeds), *means, *filtered, share)
+        best = self.ranking[0]
+        columns: dict[str, Callable[[str], str]] = {
+            "seeds": lambda name: f"mixture of {n}" if (n := self.mixtures.get(name)) else str(self.rows[name].seeds),
+            f"IWAE bound ↑\nK = {self.particles}": lambda name: str(self[name]["IWAE bound"]),
+            "difference to the best": lambda name: self._behind(name, best, "IWAE bound"),
+        }
+        if self.leave_future_out:
+            observed, horizon = self.leave_future_out
+            first = max(self.rows, key=lambda name: self[name]["LFO"].mean)
+            few = {name: (row.bounds["LFO particles"] < EFFECTIVE).mean() for name, row in self.rows.items()}
+            columns |= {
+                f"LFO ↑\nL = {observed}, M = {horizon}": lambda name: str(self[name]["LFO"]),
+                "difference to\nthe best LFO": lambda name: self._behind(name, first, "LFO"),
+                "unreliable\nIWAE, LFO": lambda name: f"{_percent(self.rows[name].unreliable)}, {_percent(few[name])}",
+            }
+            errors = ", ".join(f"{name} {self.monte_carlo_error(name):.2g}" for name in self.ranking)
+            lines = [
+                f"LFO: log density of M {step}s given all earlier ones, from L {step}s on; its Monte Carlo standard "
+                f"error: {errors}",
+                f"unreliable: share of {unit}s with k-hat > {KHAT} (IWAE), and with fewer than {EFFECTIVE} effective "
+                f"particles at some step, of {self.particles} in each of {REPLICATES} estimates (LFO)",
+            ]
+        else:
+            columns |= {
+                "95 % (df)": lambda name: "–" if name == best else _interval(self.difference(name, best)),
+                "ELBO ↑": lambda name: str(self[name]["ELBO"]),
+            }
+            if self.filter_particles:
+                columns[f"FIVO bound ↑\nK = {self.filter_particles}"] = lambda name: str(
+                    self[name].get("FIVO bound", "–")
+                )
+            columns[f"k-hat\n> {KHAT}"] = lambda name: _percent(self.rows[name].unreliable)
+            lines = [
+                "95 %: confidence interval from both errors (df: degrees of freedom of Student's t)",
+                f"k-hat > {KHAT}: share of {unit}s whose IWAE bound is unreliable",
+            ]
+        lines = [f"mean ± standard error over {unit}s{clustered} ± over seeds", *lines]
+        lines += [] if self.samples else self.notes
+        lines += [f"{name}: {note}" for name, row in self.rows.items() for note in row.notes]
+        table = _table(f"{self._title()}\nteacher-forced, nats a {step}", "\n".join(lines), columns)
+        for name in self.ranking:
+            table.add_row(name, *(cell(name) for cell in columns.values()))
         return table
+
+    def _behind(self, name: str, best: str, metric: str) -> str:
+        return "–" if name == best else str(self.difference(name, best, metric))
 
     def _latent_table(self) -> Table:
         limit = f"at most log {self.contrasts} = {math.log(self.contrasts):.2f}" if self.contrasts else "not computed"
@@ -522,6 +598,10 @@ def _table(title: str, caption: str, columns: Iterable[str]) -> Table:
     for column in columns:
         table.add_column(column, justify="right", overflow="fold")
     return table
+
+
+def _percent(share: float) -> str:
+    return "–" if math.isnan(share) else f"{100 * share:.1f} %"
 
 
 def _interval(estimate: Estimate) -> str:

@@ -33,6 +33,7 @@ from ..bounds.predictive import predictive_bound
 from .baselines import Forecaster
 from .evaluation import Evaluation, Row
 from .evaluation_windows import EvaluationWindows, on_device_of, prepare_windows, refuse_non_finite, seeded_evaluation
+from .external import ForecastSamples
 from .record import plain
 from .references import References
 from .result import progress_bar
@@ -40,7 +41,7 @@ from .scores import KL, LOG_SCORE, TEACHER_FORCED, Measure, Metric, Scores, clus
 
 
 def evaluate(
-    model: nn.Module | Mapping[str, nn.Module],
+    model: nn.Module | Mapping[str, Any],
     windows: HeldOutWindows,
     *,
     scores: Scores = proper,
@@ -64,7 +65,9 @@ def evaluate(
     `batch_size`, because draws are made by batch. The models' modes and torch's random state are restored.
 
     Args:
-        model: a model (`Forecasting`), or `{name: model}`.
+        model: a model (`Forecasting`), or `{name: model}`. In place of a model, samples of forecasts by other software:
+            an array (K, N, T, D) in the order of `windows.keys`, a mapping from these keys to (K, T, D), a list of
+            gluonts or darts forecasts, or the path of a file (`inference.evaluation.external`).
         windows: `ArrayWindows`, or any `HeldOutWindows`; for data with parts, such as `dvae.tables.PanelData`, the test
             split is used.
         scores: function from the windows to scores of forecasts: `proper` scoring rules, `calibrated`, which adds
@@ -92,7 +95,8 @@ def evaluate(
         The evaluation; print it, or use its `table`, `plot` and `to_json`.
 
     Raises:
-        TypeError: when a model cannot forecast, or the data do not define which steps are observed.
+        TypeError: when a model cannot forecast, forecasts have no samples, or the data do not define which steps are
+            observed.
         ValueError: when windows are ragged or have no step to predict, a forecast has the wrong shape, or `samples` is
             below one. Also when two scores, or a model and a reference row, have the same name, or a requested
             reference row is not available.
@@ -105,16 +109,23 @@ def evaluate(
         ['energy score', 'variogram score', 'CRPS']
     """
     models: dict[str, Any] = dict(model) if isinstance(model, Mapping) else {"model": model}
-    _check(models, samples, batch_size, bound_particles, log_score_particles)
+    _check(samples, batch_size, bound_particles, log_score_particles)
     eval_windows = prepare_windows(windows)
     windows = eval_windows.windows
+    given = {
+        name: ForecastSamples.of(each, name, eval_windows.observed)
+        for name, each in models.items()
+        if not isinstance(each, Forecasting)
+    }
+    models = {name: each for name, each in models.items() if name not in given}
+    external = {name: each.aligned(eval_windows, name) for name, each in given.items()}
     measures = _measures(scores, windows)
     means = any(measure.of_means for measure in measures)
     is_drawn = {name: _is_drawn(each, draw_emission, means) for name, each in models.items()}
     evaluator = _Evaluator(eval_windows, measures, bound_particles, log_score_particles)
     available = References(eval_windows, samples, seed, training_windows, season)
     baselines = _references(references, available, measures)
-    if clash := models.keys() & baselines.keys():
+    if clash := (models.keys() | given.keys()) & baselines.keys():
         raise ValueError(f"a model must not have the name of a reference row: {', '.join(sorted(clash))}")
 
     rows: dict[str, Row] = {}
@@ -127,6 +138,10 @@ def evaluate(
         for name, (count, forecaster) in baselines.items():
             cluster_scores, histograms = evaluator.forecasts(name, forecaster, count, parts(name))
             rows[name] = Row(count, cluster_scores, histograms=histograms)
+        for name, (count, forecaster) in external.items():
+            cluster_scores, histograms = evaluator.forecasts(name, forecaster, count, parts(name))
+            config = {**(configs or {}).get(name, {}), **given[name].record()}
+            rows[name] = Row(count, cluster_scores, config=config, histograms=histograms)
         for name, each in models.items():
             with seeded_evaluation(each, seed):
                 forecast_options = {"draw_emission": is_drawn[name], **(options or {})}
@@ -140,7 +155,9 @@ def evaluate(
             equations = {"generative": each.generative.text, "inference": each.inference.text}
             rows[name] = Row(samples, cluster_scores, equations, dict((configs or {}).get(name, {})), histograms)
 
-    kinds = {"drawn" if each else "mean" for each in is_drawn.values() or [_is_drawn(None, draw_emission, means)]}
+    kinds = {"drawn" if each else "mean" for each in is_drawn.values()}
+    if not kinds:
+        kinds = {"given" if given else "drawn" if _is_drawn(None, draw_emission, means) else "mean"}
     return Evaluation(
         rows=rows,
         metrics=evaluator.metrics(rows),
@@ -156,7 +173,13 @@ def evaluate(
         notes=[
             *dict.fromkeys([*eval_windows.notes, *(measure.note for measure in measures if measure.note)]),
             *(available.notes if references is True else ()),
-            *_forecast_notes(measures, samples, [name for name, each in is_drawn.items() if not each]),
+            *_given_notes({name: count for name, (count, _) in external.items()}, samples if models else None),
+            *_forecast_notes(
+                measures,
+                samples,
+                [name for name, each in given.items() if each.emission == "mean"]
+                + [name for name, each in is_drawn.items() if not each],
+            ),
             *(
                 f"{name} is deterministic: its {samples} forecasts of a window are equal, and so is the best of them"
                 for name, each in models.items()
@@ -173,16 +196,10 @@ def evaluate(
     )
 
 
-def _check(models: Mapping[str, Any], samples: int, batch_size: int, *particles: int) -> None:
+def _check(samples: int, batch_size: int, *particles: int) -> None:
     require(Count, samples=samples, batch_size=batch_size)
     for name, count in zip(("bound_particles", "log_score_particles"), particles, strict=True):
         require(Delay, **{name: count})
-    for name, each in models.items():
-        if not isinstance(each, Forecasting):
-            raise TypeError(
-                f"{name!r} is a {type(each).__name__}; expected a model that forecasts, such as a DynamicalVAE (see "
-                "dvae.program.protocols.Forecasting for the methods that it needs)"
-            )
 
 
 def _measures(scores: Scores, windows: HeldOutWindows) -> list[Measure]:
@@ -208,6 +225,14 @@ def _is_drawn(model: Any, draw_emission: bool | None, means: bool) -> bool:
 def _is_deterministic(model: Any, is_drawn: bool) -> bool:
     """Return whether all forecasts of a window are equal: means of a model without latents."""
     return isinstance(model, DynamicalVAE) and not (is_drawn or model.latents or model.summed or model.shared)
+
+
+def _given_notes(counts: Mapping[str, int], samples: int | None) -> Iterator[str]:
+    """Yield notes on forecasts of other software with these numbers of samples per window."""
+    if counts:
+        yield f"forecasts of {', '.join(counts)} were given, and not drawn from a model here"
+    if other := [f"{name} ({count})" for name, count in counts.items() if samples not in (None, count)]:
+        yield f"best-of-K scores are not comparable with those of K = {samples}: {', '.join(other)}"
 
 
 def _forecast_notes(measures: Sequence[Measure], samples: int, of_means: Sequence[str]) -> Iterator[str]:

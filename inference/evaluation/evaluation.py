@@ -78,6 +78,11 @@ class Row:
         default_factory=dict
     )
 
+    @property
+    def is_reference(self) -> bool:
+        """Whether this row is neither a model nor forecasts that the user gave."""
+        return not (self.equations or self.config)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(Result):
@@ -93,7 +98,7 @@ class Evaluation(Result):
         protocol: fields of the windows' protocol.
         samples: K, number of forecasts requested from every method.
         emission: "mean" or "drawn": whether forecasts were means of p(x_t | ...) or draws from it; "drawn or mean" if
-            discrete models were drawn and others not.
+            discrete models were drawn and others not; "given" if there are only forecasts of other software.
         bound_particles: number of particles of the IWAE bound, 0 if it was not computed.
         seed: seed of every method's draws.
         log_score_particles: number of particles of the log score, 0 if it was not computed.
@@ -165,11 +170,11 @@ class Evaluation(Result):
     def best_reference(self) -> str | None:
         """Reference row with the lowest headline score; None without one.
 
-        Rows without equations are references. Those with a score of 0 are true futures, and are not considered.
+        Reference rows with a score of 0 are true futures, and are not considered.
         """
         if self.headline is None:
             return None
-        scores = {name: self[name].get(self.headline) for name, row in self.rows.items() if not row.equations}
+        scores = {name: self[name].get(self.headline) for name, row in self.rows.items() if row.is_reference}
         means = {name: score.mean for name, score in scores.items() if score is not None and score.mean > 0}
         return min(means, key=means.__getitem__, default=None)
 
@@ -200,7 +205,7 @@ class Evaluation(Result):
         sentences, best, score = list[str](), self.best_reference, self.headline
         if best is None or score is None:
             return []
-        for name in [name for name, row in self.rows.items() if row.equations and score in row.cluster_means]:
+        for name in [name for name, row in self.rows.items() if not row.is_reference and score in row.cluster_means]:
             skill, values = self.skill(name), f"{score} {self[name][score]} against {self[best][score]}"
             if skill.mean < -2 * skill.standard_error:
                 sentences.append(f"{name} is worse than {best} ({values})")
@@ -515,5 +520,6 @@ class Evaluation(Result):
         parts = [name, f"{self.data['windows']} windows of {len(self.clusters)} {axis_names(self.data)[0]}s"]
         parts += self.data.get("title", [])
         parts += [f"{name} {value}" for name, value in self.options.items()]
-        parts += [f"{self.emission} emission", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
+        kind = "forecasts" if self.emission == "given" else "emission"
+        parts += [f"{self.emission} {kind}", f"seed {self.seed}", f"data {self.data['fingerprint'][:12]}"]
         return " · ".join(part for part in parts if part)

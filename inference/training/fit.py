@@ -277,7 +277,10 @@ def fit(
     if too_short := getattr(train, "too_short", ""):
         warnings.warn(f"training leaves out {too_short}", stacklevel=4)
     names = Training.__dataclass_fields__.keys() & options
-    training = replace(model.training(schema), **{name: options.pop(name) for name in names})
+    defaults = model.training(schema)
+    if validation is None:
+        defaults = replace(defaults, select="bound", patience=None)  # both need validation data
+    training = replace(defaults, **{name: options.pop(name) for name in names})
     method = model.resolve_defaults(train)
     if out is not None and config is None and hasattr(data, "recorded"):
         loop_options["config"] = run_config(method, schema, data.kind, data.recorded())

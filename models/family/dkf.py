@@ -52,6 +52,8 @@ class Gated:
 class GatedTransition(Network):
     """Network of `Gated`."""
 
+    stationary = True
+
     def __init__(self, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, 2 * size)
         previous, *others = inputs

@@ -199,6 +199,7 @@ class KalmanNetwork(Network):
     """Network of `Kalman`; the features are location and whitening matrix of the prediction, (..., D + D * D)."""
 
     distribution = Triangular
+    stationary = streams = True
     log_noise: Tensor
     log_emission: Tensor
 
@@ -385,7 +386,8 @@ class KalmanNetwork(Network):
         mean, covariance, emission = state.mean, state.covariance, state.emission
         values = samples[self.inputs[0].name] if state.known is None else state.known
         before = values[t - 1].to(self.A.dtype) if t else self.first.expand(len(mean), -1)
-        present = None if state.present is None or not t else state.present[t - 1]
+        masks = samples.get(presence(self.inputs[0].name)) if state.present is None else state.present
+        present = None if masks is None or not t else masks[t - 1]
         if present is not None:
             before = torch.where(present[:, None], before, (emission @ mean[..., None])[..., 0].to(before.dtype))
         gates = functional.linear(before, self.memory.weight_ih_l0, self.memory.bias_ih_l0)

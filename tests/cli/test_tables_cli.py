@@ -298,7 +298,9 @@ def test_options_for_another_kind_of_data_are_errors(people, table_runs, tmp_pat
     for option in ("--observed", "--test"):
         error = failure(capsys, "fit", "vae", *out, option, "0", code=2)
         assert f"{option} is for tables; give the path of a table with --data" in error
-    assert "people.npz holds" in failure(capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2)
+    assert "people.npz cannot be read as npz: it holds" in failure(
+        capsys, "fit", "vae", *out, "--data", people, "--horizon", "3", code=2
+    )
     for option in (["--joints", "LWrist"], ["--pose-prior", "a"], ["--missing"]):
         assert "is for motion" in failure(capsys, "evaluate", table_runs / "vae", *option, code=2)
     assert "--fix is for motion" in failure(capsys, "forecast", table_runs / "vae", *out, "--fix", "lower", code=2)

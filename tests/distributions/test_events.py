@@ -10,8 +10,8 @@ from pyro import poutine
 import dvae
 from dvae import DynamicalVAE, SequenceELBO, fivo_bound, iwae_bound
 from dvae.distributions import Family, FixedNormal, Vamp
-from dvae.inference.bounds.particles import Filter
 from dvae.networks import Recurrent
+from dvae.program.particles import Particles
 
 B, T = 3, 5
 PAIR = "p(w) p(z_t | z_{t-1}, w) p(x_t | x_{t-1}, z_t, w)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{1:T}, w)"
@@ -63,8 +63,8 @@ def test_partly_missing_events_are_an_error():
 def test_particle_weights_equal_the_densities_of_the_program(kind, batch):
     """Without resampling, the particle filter is importance sampling; with resampling, its bound is finite."""
     model, observations = build(kind), data(kind, **BATCHES[batch]())
-    run = Filter(model, observations, 4)
-    bound = run.run(0.0).bound
+    run = Particles(model, model.rollout(observations), 4)
+    bound = run.run(0.0)[0]
     latents = {name: value for name, value in run.drawn.items() if name in model.latents}
     many = dvae.program.batch.repeat(observations, 4)
     trace = poutine.trace(poutine.condition(model.guide, data=latents)).get_trace(many)

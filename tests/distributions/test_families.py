@@ -13,6 +13,7 @@ from scipy import special, stats
 import dvae
 from dvae import distributions
 from dvae.distributions import Family, Shape
+from dvae.distributions.hurdle import HurdleLogNormal
 from dvae.inference.training.svi import NonFiniteError
 from dvae.networks import Dense, Recurrent
 from dvae.program.model import DynamicalVAE
@@ -94,7 +95,7 @@ class TestSeveralVariables(dvae.testing.FactorizationContract):
 @pytest.mark.parametrize("name", ALL)
 def test_draws_have_the_mean_of_their_distribution(name):
     distribution = ALL[name].build(Shape(3, 4)).double()
-    parameters = distribution(torch.randn(2, 4, dtype=torch.float64))
+    parameters = distribution(0.3 * torch.randn(2, 4, dtype=torch.float64))  # moderate tails
     n = 20_000
     many = tuple(p.expand(n, *p.shape) for p in parameters)
     draws = distribution.draw(many, distribution.noise((n, 2, 3), parameters[0]))
@@ -112,6 +113,11 @@ DENSITIES = {
     "laplace": lambda p, v: stats.laplace(p[0], p[1]).logpdf(v),
     "positive": lambda p, v: stats.gamma(p[0], scale=1 / p[1]).logpdf(v),
     "log-normal": lambda p, v: stats.lognorm(p[1], scale=np.exp(p[0])).logpdf(v),
+    "hurdle": lambda p, v: np.where(
+        v == 0,
+        stats.logistic.logcdf(p[0]),
+        stats.logistic.logsf(p[0]) + stats.lognorm(p[2], scale=np.exp(p[1])).logpdf(np.where(v == 0, 1, v)),
+    ),
     "power": lambda p, v: stats.expon(scale=1 / p[0]).logpdf(v),
     "share": lambda p, v: stats.beta(p[0], p[1]).logpdf(v),
     "angle": lambda p, v: stats.vonmises(p[1], p[0]).logpdf(v),
@@ -165,6 +171,7 @@ def test_rescaling_a_distribution_is_a_change_of_variables(name):
     if not distribution.distribution(parameters).support.is_discrete:
         value = distribution.draw(parameters, distribution.noise((2, 3), parameters[0])).detach()
         volume = scale.log() if not distribution.distribution(parameters).event_shape else scale.log().sum()
+        volume = torch.where(value == 0, 0.0, volume) if name == "hurdle" else volume  # the mass at 0 has no volume
         log_density = distribution.distribution(parameters).log_prob(value)
         torch.testing.assert_close(
             distribution.distribution(rescaled).log_prob(mean + scale * value), log_density - volume
@@ -203,6 +210,24 @@ def test_an_event_in_a_product_counts_once_and_cannot_be_partly_missing():
     masked = model.log_joint({"x": data["x"], "mask": mask}, {"z": data["z"]})["x"]
     torch.testing.assert_close(complete[1:], masked[1:], rtol=1e-12, atol=0)
     assert complete[0] < masked[0]
+
+
+def test_a_hurdle_is_a_point_mass_at_zero_and_a_log_normal():
+    gate, loc, scale = (torch.tensor([each], dtype=torch.float64) for each in (0.4, 0.2, 0.7))
+    hurdle = HurdleLogNormal(gate, loc, scale)
+    torch.manual_seed(0)
+    draws = hurdle.sample((100_000,))
+    assert (draws == 0).double().mean().item() == pytest.approx(
+        gate.sigmoid().item(), abs=5 * (0.25 / len(draws)) ** 0.5
+    )
+    assert draws.var().item() == pytest.approx(hurdle.variance.item(), rel=0.1)
+    grid = torch.linspace(1e-4, 60, 200_001, dtype=torch.float64)[:, None]
+    mass = torch.trapezoid(hurdle.log_prob(grid).exp(), grid, dim=0) + hurdle.log_prob(torch.zeros(1)).exp()
+    torch.testing.assert_close(mass, torch.ones(1, dtype=torch.float64), atol=1e-6, rtol=0)
+    for value in (-1.0, 0.0, 0.5, 2.0):
+        assert (draws <= value).double().mean().item() == pytest.approx(
+            hurdle.cdf(torch.tensor([value])).item(), abs=0.01
+        )
 
 
 # ------------------------------------------------------------- draws against densities, by a posterior on a grid

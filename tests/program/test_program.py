@@ -15,11 +15,11 @@ from pyro.infer import SVI, Trace_ELBO
 
 import dvae
 from dvae import DynamicalVAE, SequenceELBO
-from dvae.inference.bounds.particles import Filter
 from dvae.inference.training.fit import Callback
 from dvae.locking import serialized
 from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Recurrent
+from dvae.program.particles import Particles
 from dvae.testing import FactorizationContract
 
 SRNN = ("p(z_t | x_{<t}, z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | z_{t-1}, x_{1:T})")
@@ -89,9 +89,9 @@ class TestRowMaskOfAttention(FactorizationContract):
         """Their weights equal the densities of the programs."""
         model = self._model()
         data = self._data(model)
-        particles = Filter(model, data, 1)
+        particles = Particles(model, model.rollout(data), 1)
         with torch.no_grad():
-            bound = particles.run(0.0).bound
+            bound = particles.run(0.0)[0]
         latents = particles.drawn
         guide = pyro.poutine.trace(pyro.poutine.condition(model.guide, data=latents)).get_trace(data)
         guide.compute_log_prob()

@@ -43,7 +43,10 @@ def test_repeated_values_of_a_continuous_column_are_a_spike():
     values = noise(3, 200, 1)
     rain = np.where(values > 0.5, values, 0)
     (text,) = found(rain)
-    assert "% of 'x0' are 0 (one binary column for it, and another that is empty there)" in text
+    assert "% of 'x0' are 0 (the family hurdle)" in text
+    assert not found(rain, (Column("x0", family="hurdle"),))
+    (text,) = found(rain + 1)
+    assert "% of 'x0' are 1 (one binary column for it, and another that is empty there)" in text
     assert "bounds can grow without limit" in text
     (text,) = found(values.round(0))
     assert "(rounding = 1 or one binary column" in text

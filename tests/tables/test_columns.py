@@ -34,6 +34,7 @@ def schemas(draw):
     special |= {name: draw(st.none() | st.just(next(names))) for name in ("time", "group", "split")}
     special |= {"zone": draw(st.sampled_from([None, "Europe/Berlin", "+02:00"]))} if special["time"] else {}
     special |= {"calendar": tuple(draw(st.lists(st.sampled_from([*FEATURES]), unique=True)))}
+    special |= {"lags": tuple(draw(st.lists(st.integers(1, 400), unique=True, max_size=3)))}
     roles = ["target", *draw(st.lists(st.sampled_from(["target", "known", "past", "static"]), max_size=3))]
     return Columns(tuple(draw(column(name, role)) for name, role in zip(names, roles, strict=False)), **special)
 
@@ -78,6 +79,10 @@ def test_a_schema_survives_toml_with_its_cut_and_json(columns, cut):
         ("calendar = ['weekdy']\n[columns.a]", r"weekdy; expected some of hour, .*did you mean 'weekday'"),
         ("calendar = ['hour', 'hour']\n[columns.a]", "hour, hour; expected some of hour, .* at most once"),
         ("calendar = [3]\n[columns.a]", r"calendar is \[3\]; expected features, such as"),
+        ("lags = [7, 7]\n[columns.a]", "lags are 7, 7; expected different numbers of steps, from 1"),
+        ("lags = [0]\n[columns.a]", "lags are 0; expected different numbers of steps, from 1"),
+        ("lags = 7\n[columns.a]", r"lags is 7; expected numbers of steps, such as \[7, 14\]"),
+        ("lags = ['7']\n[columns.a]", r"lags is \['7'\]; expected numbers of steps"),
         ("[columns.a]\nfamily = 'count'\nrounding = 1", "rounding = 1, but is a target of family 'count'; rounding is"),
         (
             "[columns.a]\n[columns.b]\nrole = 'past'\nrounding = 1",

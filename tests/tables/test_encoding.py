@@ -9,6 +9,7 @@ import torch
 from dvae.distributions import FAMILIES
 from dvae.distributions.product import Product
 from dvae.tables import Column, Columns, Panel, Series
+from dvae.tables.ahead import ahead
 from dvae.tables.encoding import PanelSchema
 from dvae.tables.protocol import Cut
 from dvae.tables.windows import PanelWindows
@@ -287,3 +288,62 @@ def test_training_parts_without_values_or_windows_are_an_error():
         PanelSchema.from_data(panel, CUT)
     with pytest.raises(ValueError, match=r"no training window of 50 \+ 3 steps: its longest sequence has 12 steps"):
         PanelSchema.from_data(panel, Cut(50, 3))
+
+
+LAGGED = Columns(
+    (
+        Column("riders", family="count"),
+        Column("kind", family="category", classes=KINDS),
+        Column("price", family="positive"),
+    ),
+    lags=(3, 5),
+)
+
+
+def lagged(t=12, missing=True, seed=0):
+    rng = np.random.default_rng(seed)
+    values = np.stack([rng.poisson(4, t), rng.integers(0, 3, t), rng.gamma(2, 1, t)], 1).astype(float)
+    if missing:
+        values[rng.random(values.shape) < 0.2] = NAN
+    return Panel([Series(f"s{n}", values if n == 0 else rng.permutation(values)) for n in range(6)], LAGGED)
+
+
+def test_lagged_values_are_relative_to_the_steps_up_to_them():
+    panel = lagged()
+    schema = PanelSchema.from_data(panel, CUT)
+    sequence = panel.series[0]
+    x = schema.targets(sequence).copy()
+    x[:, 0], x[:, 4] = np.log1p(x[:, 0]), np.log(x[:, 4])
+    expected = np.zeros((len(x), 2, 2, 5))
+    for t in range(len(x)):
+        for place, lag in enumerate(LAGGED.lags):
+            recent = x[max(t - lag - CUT.observed + 1, 0) : t - lag + 1] if t >= lag else x[:0]
+            for d in range(5):
+                cells = recent[~np.isnan(recent[:, d]), d]
+                if len(recent) and not np.isnan(recent[-1, d]):
+                    scale = cells.std()
+                    expected[t, place, :, d] = (cells[-1] - cells.mean()) / scale if scale > 1e-12 else 0.0, 1.0
+    context = schema.context(sequence)
+    assert context.shape[1] == schema.sizes["c"] == 20
+    assert context == pytest.approx(expected.reshape(len(x), -1), abs=1e-9)
+    assert 0 < context[:, 5:10].mean() < 1  # indicators
+
+
+def test_lags_read_nothing_of_the_future():
+    panel = lagged(missing=False)
+    schema = PanelSchema.from_data(panel, CUT)
+    windows = PanelWindows(panel, schema, "test")
+    (_, name, start), first = windows.keys[-1], windows.all()["c"][-1]
+    index = [sequence.name for sequence in panel].index(name)
+    panel.series[index].values[start + CUT.observed :, [0, 2]] += 3
+    assert torch.equal(PanelWindows(panel, schema, "test").all()["c"][-1], first)
+    panel.series[index].values[start + CUT.observed - 1, 0] += 3
+    assert not torch.equal(PanelWindows(panel, schema, "test").all()["c"][-1], first)
+
+
+def test_lags_are_known_beyond_the_table_up_to_the_shortest_one():
+    panel = lagged(missing=False)
+    schema = PanelSchema.from_data(panel, CUT)
+    assert ahead(panel, schema).all()["c"][:, -1, 5:10].all()  # indicators of the first lag
+    with pytest.raises(ValueError, match="lag 3 is below the horizon 4, so its values are unknown"):
+        ahead(panel, schema, 4)

@@ -191,7 +191,7 @@ VALUES = {
     "angle": ([-np.pi, np.pi], [3.2, -4]),
     "positive": ([0.5, 3], [0, -1, 1e-50]),
     "log-normal": ([0.5, 3], [0, -1]),
-    "power": ([0, 2.5], [-0.1]),
+    **dict.fromkeys(("hurdle", "power"), ([0, 2.5], [-0.1])),
     **dict.fromkeys(("count", "overdispersed", "sparse", "sparse-overdispersed"), COUNTS),
 }
 """Values inside and outside the support of a family. Other families have all values."""

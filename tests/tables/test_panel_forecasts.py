@@ -1,6 +1,8 @@
 """Every method on a table of several kinds of columns, and the files of its forecasts."""
 
 import json
+import re
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -241,6 +243,20 @@ def test_times_are_written_with_all_digits_and_in_their_zone(tmp_path, calendar,
     figure.canvas.draw()
     labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
     assert calendar.zone is None or "04:00" in labels
+
+
+def test_quantiles_of_counts_are_counts():
+    result, counts = forecasts(), np.random.default_rng(0).poisson(3.0, (50, 2, 3, 1))
+    draws = np.concatenate([counts, counts + 0.25], -1)
+    frame = replace(result, draws=draws).table()
+    names = [name for name in frame if re.fullmatch(r"q\d+", name)]
+    whole, others = (frame[frame.column == name][names].to_numpy() for name in result.columns)
+    assert (whole % 1 == 0).all()
+    assert (others % 1 != 0.25).any()  # interpolated
+    low, high = (frame[frame.column == "y"][name].to_numpy().reshape(2, 3) for name in ("q050", "q950"))
+    exact = np.quantile(counts[..., 0], [0.05, 0.95], axis=0, method="weibull")
+    assert ((low <= exact[0]) & (exact[1] <= high)).all()
+    assert (high - low < exact[1] - exact[0] + 2).all()
 
 
 def test_prediction_bands_are_the_quantiles():

@@ -685,6 +685,11 @@ class Windows:
         return [name for j, name in enumerate(names) if self.protocol.root != "drop" or j != root]
 
     @property
+    def columns(self) -> list[str]:
+        """Names of the D numbers of a frame, such as Head_x."""
+        return [f"{joint}_{axis}" for joint in self.joints for axis in "xyz"]
+
+    @property
     def given_joints(self) -> tuple[str, ...] | None:
         """Names of the joints whose trajectories are in the batches; None if they differ between windows."""
         if not isinstance(self._given, Tensor):

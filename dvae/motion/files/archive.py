@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ...data.npy import LONGEST, NpyError, check_bytes, dtype_of, header
+from ...data.npy import LONGEST, NpyError, check_bytes, check_text, dtype_of, header
 from ..geometry.skeleton import is_name
 
 LARGEST = 4 * 2**30
@@ -258,10 +258,7 @@ class Member:
             check_bytes(dtype, shape, stream.left)
             array = np.empty(shape, dtype, order)
             stream.readinto(array)
-        if dtype.kind == "U":
-            points = array.reshape(-1).view(f"{dtype.str[0]}u4")
-            if ((points > 0x10FFFF) | (points >> 11 == 0xD800 >> 11)).any():
-                raise NpyError(f"{self.name}: damaged: its text has invalid characters")
+        check_text(self.name, array)
         return array
 
     def clips(self) -> list[tuple[str, str, np.ndarray]]:

@@ -77,7 +77,11 @@ TOGETHER = 64
 
 
 def scores(
-    windows: HeldOutWindows, pose_prior: Any = None, classifiers: Mapping[str, Any] | None = None
+    windows: HeldOutWindows,
+    pose_prior: Any = None,
+    classifiers: Mapping[str, Any] | None = None,
+    itself: bool = True,
+    paces: Mapping[str, float] | None = None,
 ) -> list[Measure]:
     """Return the scores of the motion papers for these windows.
 
@@ -90,6 +94,10 @@ def scores(
             flow's z, without the log-determinant (the NLL of GSPS, arXiv:2108.08422).
         classifiers: `{name: fitted action classifier}`, for the scores "ACC name" and "FID name" and a reference row of
             real motion. Classifiers must be fitted under the same protocol and without test clips.
+        itself: whether a window is among its own multimodal truths, as in the public code of DLow, GSPS, BeLFusion and
+            HumanMAC. If not, windows without others are left out of the multimodal errors.
+        paces: {class: mean motion of the joints between frames, in metres}, for the CMD by "action" as in BeLFusion's
+            public code, which uses constants; default: the paces of the true futures, by "content".
 
     Raises:
         TypeError: the windows have no skeleton.
@@ -102,7 +110,7 @@ def scores(
             "errors in metres only, use dvae.motion.displacements"
         )
     moves = windows.protocol.root == "relative"
-    measures = displacements(windows, _body(windows.skeleton) if moves else lambda x: x)
+    measures = displacements(windows, _body(windows.skeleton) if moves else lambda x: x, itself=itself)
     if moves:
         measures += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
     if windows.given_joints:
@@ -110,7 +118,7 @@ def scores(
     bones = _bones(windows)
     measures += _limbs(windows, *bones)
     if windows.protocol.predicted > 1:
-        measures.append(_cumulative_motion(windows))
+        measures.append(_cumulative_motion(windows, paces))
     if windows.protocol.observed + windows.protocol.predicted > SEAM:
         measures.append(_jerk(windows))
     if pose_prior is not None:
@@ -133,7 +141,10 @@ _MULTIMODAL = ("MMADE", "MMFDE", "MMADEm", "MMFDEm")
 
 
 def displacements(
-    windows: HeldOutWindows, body: Callable[[Tensor], Tensor] = lambda x: x, threshold: float | None = None
+    windows: HeldOutWindows,
+    body: Callable[[Tensor], Tensor] = lambda x: x,
+    threshold: float | None = None,
+    itself: bool = True,
 ) -> list[Measure]:
     """Return diversity, errors of the best and of the median future, and proper scores.
 
@@ -143,6 +154,7 @@ def displacements(
         body: function that selects the compared part of frames (..., T, D).
         threshold: distance below which last observed frames count as the same, in the unit of the data; default: the
             protocol's `multimodal_threshold`, or else 0.5, as in the papers.
+        itself: whether a window is among its own multimodal truths, as in `scores`.
     """
 
     def of_body(measure: Measure) -> Measure:
@@ -157,7 +169,7 @@ def displacements(
         return metrics.energy_score(forecasts, truth, None if truth.isnan().any() else diversity(forecasts))
 
     apd = Measure("APD", lambda forecasts, *_: diversity(forecasts), "m", "higher")
-    several = [] if isinstance(windows, ExchangedWindows) else _multimodal(windows, body, diversity, threshold)
+    several = [] if isinstance(windows, ExchangedWindows) else _multimodal(windows, body, diversity, threshold, itself)
     proper = [replace(ENERGY, function=energy), VARIOGRAM]
     return list(map(of_body, [apd, _ADE, _FDE, *several[:2], *_MEDIAN, *several[2:], *proper]))
 
@@ -167,23 +179,28 @@ def _multimodal(
     body: Callable[[Tensor], Tensor],
     diversity: Callable[[Tensor], Tensor],
     threshold: float | None,
+    itself: bool,
 ) -> list[Measure]:
     """Return errors averaged over the futures of all windows in almost the same pose, and the APDE."""
     threshold = getattr(windows.protocol, "multimodal_threshold", 0.5) if threshold is None else threshold
     truths = multimodal_truths(windows, threshold)
     futures = body(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :])
     alone = sum(len(truths_of_window) == 1 for truths_of_window in truths)
-    settings: dict[str, Any] = {"threshold": threshold, "itself": True, "alone": alone}
+    others = truths if itself else multimodal_truths(windows, threshold, itself)
+    settings: dict[str, Any] = {"threshold": threshold, "itself": itself, "alone": alone}
     shared: Any = {
         "unit": "m",
         "note": multimodal_note(**settings, windows=len(truths)),
         "basis": {"multimodal": settings},
     }
 
+    pool: Any = {} if itself else {"pool": means_of_those_that_count}
+
     @lru_cache(maxsize=1)  # shared by all scores of a batch
     def errors(forecasts: Tensor, index: Tensor) -> Tensor:
-        pairs = zip(forecasts, index.tolist(), strict=True)
-        return torch.stack([multimodal_errors(window, futures[truths[n]]) for window, n in pairs])
+        none = forecasts.new_full((len(_MULTIMODAL),), math.nan)
+        pairs = [(window, futures[others[n]]) for window, n in zip(forecasts, index.tolist(), strict=True)]
+        return torch.stack([multimodal_errors(window, each) if len(each) else none for window, each in pairs])
 
     def error(place: int) -> Callable[..., Tensor]:
         return lambda forecasts, truth, past, index: errors(forecasts, index)[:, place]
@@ -197,8 +214,9 @@ def _multimodal(
         return (diversity(forecasts) - real()[index]).abs()
 
     truths_of_window = [
-        Measure(name, error(place), headline=name in ("MMADE", "MMFDE"), **shared)
+        Measure(name, error(place), headline=name in ("MMADE", "MMFDE"), **shared, **pool)
         for place, name in enumerate(_MULTIMODAL)
+        if itself or alone < len(truths)
     ]
     apde = Measure("APDE", diversity_error, pool=means_of_those_that_count, **shared)
     return [*truths_of_window, *([apde] if alone < len(truths) else [])]
@@ -334,14 +352,18 @@ def _cross(first: Tensor, second: Tensor) -> Tensor:
     return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
-def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
+def _cumulative_motion(windows: Windows | ExchangedWindows, paces: Mapping[str, float] | None = None) -> Measure:
     """Return the CMD, computed class by class."""
-    label = "content"
+    label = "action" if paces else "content"
     try:
         labels = windows.labels(label)
     except KeyError:
+        if paces:
+            raise
         label, labels = "", [""] * len(windows)
     names = sorted(set(labels))
+    if unknown := {*names} - {*(paces or names)}:
+        raise ValueError(f"paces have no class {', '.join(sorted(unknown))}; give one for each action of the windows")
     classes = torch.tensor([names.index(label_of_window) for label_of_window in labels])
     body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
 
@@ -354,6 +376,9 @@ def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
         return mean_of_known(moved(_where_true(forecasts, truth)), 1)
 
     real = mean_of_known(moved(Batch(windows.all()).mask_to_nan()[:, windows.protocol.observed :]), -1)
+    source = "the pace of its true futures"
+    if paces:
+        real, source = torch.tensor([paces[name] for name in labels]).to(real), "a given pace"
     scope = f"each {label} is a class, {len(names)} in total" if label else "all windows are one class"
     return Measure(
         "CMD",
@@ -361,8 +386,8 @@ def _cumulative_motion(windows: Windows | ExchangedWindows) -> Measure:
         "m",
         partial=windows.missing,
         pool=lambda motion, clips: motion_pseudo_values(motion, real, classes, clips),
-        note=f"CMD: {scope}; its forecasts are compared with the pace of its true futures",
-        basis={"CMD": {"label": label, "classes": names}},
+        note=f"CMD: {scope}; its forecasts are compared with {source}",
+        basis={"CMD": {"label": label, "classes": names} | ({"paces": dict(paces)} if paces else {})},
     )
 
 

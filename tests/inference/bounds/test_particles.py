@@ -8,9 +8,9 @@ import torch
 
 from dvae import DynamicalVAE, Oracle, fivo_bound, linear_gaussian_surrogate
 from dvae.factorization.notation import Factorization
-from dvae.inference.bounds.particles import ancestors, effective_size
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import repeat
+from dvae.program.particles import ancestors, effective_size
 
 T = 5
 PAIRS = {
@@ -149,8 +149,7 @@ def textbook(model, batch, particles, resample_below):
     for name in (name for name in statics if name not in last):
         weight = weight + draw_static(name)
     moving = [name for name in model.latents if name not in statics]
-    noise = {name: torch.randn(n, T, model.sizes[name], dtype=torch.float64) for name in moving}
-    latents |= {name: torch.zeros_like(value) for name, value in noise.items()}
+    latents |= {name: torch.zeros(n, T, model.sizes[name], dtype=torch.float64) for name in moving}
     lengths = batch.get("lengths", torch.full((shape[1],), T))
     for t in range(T):
         low = (effective_size(weight.view(shape)) < resample_below * particles) & (t < lengths)
@@ -161,9 +160,10 @@ def textbook(model, batch, particles, resample_below):
             weight = weight.view(shape).masked_fill(low, 0).flatten()
             count += low
         total = torch.zeros(n, dtype=torch.float64)
+        noise = {name: torch.randn(n, model.sizes[name], dtype=torch.float64) for name in moving}
         for name in moving:
             distribution = guide().evaluate(name, latents[name].clone())
-            latents[name][:, t] = draw(distribution, noise[name])[:, t]
+            latents[name][:, t] = draw(distribution, noise[name][:, None])[:, t]
             total -= distribution.log_prob(latents[name])[:, t].sum(-1)
         rollout = generator()
         for name in (*moving, *model.observed):

@@ -102,6 +102,37 @@ def test_the_fivo_bound_is_the_filters_and_unsupported_models_get_a_note():
     assert str(Comparison.from_json(result.to_json())) == str(result)
 
 
+@pytest.mark.filterwarnings("ignore:The inplace keyword in DataFrame.sort_values:DeprecationWarning")  # arviz_stats 0.8
+def test_leave_future_out_is_compared_next_to_the_evidence(fitted):
+    import arviz_stats
+
+    models, x = fitted
+    result = run(models, x, leave_future_out=(2, 1))
+    for name, seeds in models.items():
+        exact = np.stack([(Oracle(m, T).evidence(x) - Oracle(m, 2).evidence(x[:, :2])).detach().numpy() for m in seeds])
+        np.testing.assert_allclose(result.rows[name].bounds["LFO"], exact, atol=1e-8)
+        assert result[name]["LFO"].mean == pytest.approx(exact.mean() / (T - 2))
+        assert result.monte_carlo_error(name) == 0
+    first, second = (result.rows[name].bounds["LFO"] for name in models)
+    assert result.difference("dkf", "mean field", "LFO").mean == pytest.approx((first - second).mean() / (T - 2))
+    assert result.n_forecast.tolist() == [T - 2] * 24
+    elpd = result.to_elpd()
+    assert elpd["dkf"].elpd == pytest.approx(24 * (T - 2) * result["dkf"]["LFO"].mean)
+    assert not elpd["dkf"].warning
+    table = arviz_stats.compare(elpd)
+    assert table["elpd"].max() == pytest.approx(max(each.elpd for each in elpd.values()))
+    text = str(result)
+    assert ("L = 2, M = 1" in text, "95 % (df)" in text) == (True, False)
+    assert str(Comparison.from_json(result.to_json())) == text
+    parts = [run({name: seeds}, x, leave_future_out=(2, 1)) for name, seeds in models.items()]
+    assert parts[0].join(parts[1]).to_json() == result.to_json()
+    without = run(models, x)
+    assert all(scores(without, name).items() <= scores(result, name).items() for name in models)
+    for missing in (without.to_elpd, lambda: without.monte_carlo_error("dkf")):
+        with pytest.raises(ValueError, match="leave_future_out="):
+            missing()
+
+
 # --------------------------------------------------------------------------------------------------- standard errors
 
 
@@ -286,20 +317,24 @@ def runs(tmp_path_factory):
     return folder
 
 
+LFO = ["--leave-future-out", "30", "1"]
 CHEAP = ["--particles", "25", "--contrasts", "4"]
 
 
 def test_runs_that_differ_only_in_the_seed_share_a_row(runs, capsys, tmp_path):
     paths = [str(runs / name) for name in ("a0", "b", "a1", "c")]
     out, figure = tmp_path / "comparison.json", tmp_path / "comparison.png"
-    arguments = [*paths, *CHEAP, "--samples", "2", "--out", str(out), "--figure", str(figure)]
+    arguments = [*paths, *CHEAP, *LFO, "--ensembles", "--samples", "2", "--out", str(out), "--figure", str(figure)]
     assert main(["compare", *arguments]) == 0
     output = capsys.readouterr().out
-    for part in ("vae (latent 2)", "vae (latent 3)", "dkf", "K = 25", "free-running", "ADE"):
+    for part in ("vae (latent 2)", "vae (latent 3)", "dkf", "K = 25", "free-running", "ADE", "LFO"):
         assert part in output
     result = Comparison.load(out)
     seeds = {name: row.seeds for name, row in result.rows.items()}
-    assert seeds == {"vae (latent 2)": 2, "vae (latent 3)": 1, "dkf": 1}
+    mixture = "vae (latent 2), mixture of 2 seeds"
+    assert seeds == {"vae (latent 2)": 2, "vae (latent 3)": 1, "dkf": 1, mixture: 1}
+    assert result.mixtures == {mixture: 2}
+    assert main(["compare", paths[1], "--ensembles"]) == 2
     assert result.rows["dkf"].config["method"]["latent"] == 2
     assert figure.read_bytes().startswith(b"\x89PNG")
 

@@ -1,0 +1,183 @@
+"""The exact filter of a linear-Gaussian model, for any factorization (Kalman, 1960).
+
+The state is the joint normal of the static latents and of all variables in a window of steps. A new variable is an
+affine function of them plus noise; its coefficients are the network's locations at 0 and at every unit vector. An
+observed value has variance 0. At a missing entry the model reads its own mean, an affine function of the latents.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..distributions.base import Parameters
+from ..distributions.families import FixedNormalModule, Gaussian
+from ..networks.linear import LinearNetwork
+from ..networks.loop import Rows, slide
+from ..networks.recurrent import RecurrentNetwork
+from .conditional import Conditional, like
+from .rollout import Rollout
+
+
+def is_linear_gaussian(model: Any) -> bool:
+    """Return whether all generative distributions are normals with affine locations and constant scales."""
+    for parent in (parent for factor in model.generative.factors for parent in factor.parents if parent.local):
+        ahead = parent.relation.intervals is None or 1 in parent.relation.directions
+        if ahead or (parent.name in model.observed and 0 in parent.relation.directions):
+            return False
+    has_static_data = any(not model.generative.local(name) for name in model.observed)
+    return not (model.summed or has_static_data) and all(map(_is_linear, model.generator.values()))
+
+
+def _is_linear(conditional: Conditional) -> bool:
+    network, head, units = conditional.network, conditional.head, conditional.units
+    has_logarithms = any(units[name].logarithms for name in conditional.parents if name in units)
+    if has_logarithms or conditional.exposure is not None or conditional.offset is not None:
+        return False
+    if network is None:
+        return isinstance(head, Gaussian)
+    is_affine = isinstance(network, LinearNetwork)
+    if isinstance(network, RecurrentNetwork):
+        is_affine = not (network.memories or network.extractors or network.join.first)
+    return is_affine and isinstance(head, FixedNormalModule)
+
+
+class GaussianFilter:
+    """Exact moments of every sequence, in float64; the interface is the one of `Particles`.
+
+    Args:
+        model: linear-Gaussian model.
+        known: run with the values that are known before the first step.
+        live: whether data and local context are added step by step; the length of `known` is then that of the window.
+    """
+
+    def __init__(self, model: Any, known: Rollout, live: bool):
+        self.model, self.known, self.live = model, known, live
+        order = [name for block in model.generative.blocks for name in block.names]
+        self.local = [name for name in order if model.generative.local(name)]
+        self.statics = [name for name in order if not model.generative.local(name)]
+        self.sizes = [model.sizes[name] for name in self.local]
+        self.context = {n: Rows([None] * known.length) for n in model.context if live and model.reader.local[n]}
+        self.position = -1
+
+    def start(self) -> None:
+        """Compute the moments of the static latents."""
+        batch = self.known.batch
+        self.log_weights = torch.zeros(1, batch, dtype=torch.float64, device=like(self.model).device)
+        self.mean = self.log_weights.new_zeros(batch, 0)
+        self.covariance = self.log_weights.new_zeros(batch, 0, 0)
+        for name in self.statics:
+            self._extend(name, noisy=True)
+        self.static_size = self.mean.shape[1]
+
+    def fork(self) -> GaussianFilter:
+        """Return a copy whose steps do not change this filter."""
+        forked = copy(self)
+        forked.context = {name: rows.replaced(0, rows[0]) for name, rows in self.context.items()}
+        return forked
+
+    def begin(self, resample_below: float, valid: Tensor | None = None) -> Tensor:
+        """Move to the next step."""
+        if self.live and self.position == self.known.length - 1:
+            kept = [*range(self.static_size), *range(self.static_size + sum(self.sizes), self.mean.shape[1])]
+            self.mean, self.covariance = self.mean[:, kept], self.covariance[:, kept][:, :, kept]
+            slide(self.context)
+        self.position = min(self.position + 1, self.known.length - 1)
+        return torch.zeros(self.known.batch, dtype=torch.bool, device=self.mean.device)
+
+    def feed(self, run: Rollout, t: int, names: list[str]) -> None:
+        """Add context, or data and their masks, at a step; see `Particles.feed`."""
+        self.run, self.t = run, t
+        for name in names:
+            if name not in self.model.observed:
+                self.context[name][self.position] = run.values[name][:, t]
+
+    def predict(self) -> dict[str, tuple[Conditional, Parameters, Tensor]]:
+        """Return the normal distribution of each data variable, before its data are used; see `Particles.predict`."""
+        self.noise = {name: self._extend(name, noisy=name not in self.model.observed) for name in self.local}
+        result: dict[str, tuple[Conditional, Parameters, Tensor]] = {}
+        for name in self.model.observed:
+            part = self._part(name, self.position)
+            variance = self.covariance.diagonal(dim1=1, dim2=2)[:, part] + self.noise[name].square()
+            moments = self.mean[:, part], variance.sqrt()
+            result[name] = self.model.generator[name], moments, torch.zeros_like(self.log_weights)
+        return result
+
+    def weigh(self) -> None:
+        """Condition on the data of the step, and add their log density to `log_weights`."""
+        if not self.live:
+            self.run, self.t = self.known, self.position
+        for name in self.model.observed:
+            part, mask = self._part(name, self.position), self.run.mask(name)
+            value = self.run.values[name][:, self.t].double()
+            observed = torch.ones_like(value) if mask is None else mask[:, self.t].double()
+            spread = self.covariance[:, part, part] + torch.diag_embed(self.noise[name].square().expand_as(value))
+            spread = spread * observed[:, :, None] * observed[:, None] + torch.diag_embed(1 - observed)
+            residual = (value - self.mean[:, part]) * observed
+            root = torch.linalg.cholesky(spread)
+            white = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
+            gain = torch.cholesky_solve((self.covariance[:, :, part] * observed[:, None]).mT, root).mT
+            log_density = -0.5 * white.square().sum(1) - root.diagonal(dim1=1, dim2=2).log().sum(1)
+            self.log_weights = self.log_weights + log_density - 0.5 * math.log(2 * math.pi) * observed.sum(1)
+            self.mean = self.mean + (gain @ residual[..., None])[..., 0]
+            covariance = self.covariance - gain @ spread @ gain.mT
+            # the model reads the value where it was observed, and its own mean elsewhere
+            self.mean[:, part] = torch.where(observed > 0, value, self.mean[:, part])
+            uncertain = torch.ones_like(self.mean)
+            uncertain[:, part] = 1 - observed
+            self.covariance = (covariance + covariance.mT) / 2 * uncertain[:, :, None] * uncertain[:, None]
+
+    def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
+        """Return mean and variance (B, D) of each latent `lag` steps ago, given the data so far."""
+        variance = self.covariance.diagonal(dim1=1, dim2=2)
+        parts = {name: self._part(name, max(self.position - lag, 0)) for name in self.model.latents}
+        return {
+            "mean": {name: self.mean[:, part] for name, part in parts.items()},
+            "variance": {name: variance[:, part] for name, part in parts.items()},
+        }
+
+    def _part(self, name: str, position: int) -> slice:
+        """Return the coordinates of a variable at a step of the window."""
+        if name in self.statics:
+            first = sum(self.model.sizes[other] for other in self.statics[: self.statics.index(name)])
+        else:
+            index = self.local.index(name)
+            first = self.static_size + position * sum(self.sizes) + sum(self.sizes[:index])
+        return slice(first, first + self.model.sizes[name])
+
+    def _extend(self, name: str, noisy: bool) -> Tensor:
+        """Append a variable at the current step, with or without its noise, and return its noise scale (R, D)."""
+        conditional, (batch, size) = self.model.generator[name], self.mean.shape
+        probes = torch.cat([self.mean.new_zeros(1, size), torch.eye(size).to(self.mean)])
+        names = [n for n in conditional.parents if n in self.model.context]
+        count = batch if names else 1
+        probes, steps, values = probes.repeat(count, 1).to(like(self.model)), self.position + 1, {}
+        for each in self.statics:
+            if conditional.factor.parent(each) is not None:
+                values[each] = probes[:, self._part(each, 0)]
+        if conditional.factor.local:
+            rest = probes.new_zeros(len(probes), steps * sum(self.sizes))
+            rest[:, : size - self.static_size] = probes[:, self.static_size :]
+            values |= dict(zip(self.local, rest.unflatten(1, (steps, -1)).split(self.sizes, -1), strict=True))
+        for each in names:
+            value = self.known.values.get(each)
+            if value is None:
+                value = torch.stack([self.context[each][s] for s in range(steps)], 1)
+            elif value.dim() == 3:
+                value = value[:, :steps]
+            values[each] = value.repeat_interleave(size + 1, 0)
+        location, scale = conditional(values, len(probes), max(steps, 1))
+        if conditional.factor.local:
+            location, scale = location[:, -1], scale[:, -1]
+        location, scale = (part.double().unflatten(0, (count, size + 1)) for part in (location, scale))
+        weights, scale = (location[:, 1:] - location[:, :1]).mT, scale[:, 0]
+        mean = (weights @ self.mean[..., None])[..., 0] + location[:, 0]
+        across = weights @ self.covariance
+        within = across @ weights.mT + (torch.diag_embed(scale.square()) if noisy else 0.0)
+        self.mean = torch.cat([self.mean, mean], 1)
+        self.covariance = torch.cat([torch.cat([self.covariance, across.mT], 2), torch.cat([across, within], 2)], 1)
+        return scale
