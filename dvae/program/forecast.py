@@ -185,6 +185,11 @@ def impute(
     masks = values.masks(WHOLE if model.view.parts else model.observed[0])
     if not masks:
         raise ValueError("this batch has no missing entries; give a 'mask' that is False at the entries to fill")
+    if joint := [name for name in model.observed if model.generator[name].joint]:
+        raise ValueError(
+            f"all steps of {', '.join(joint)} are drawn jointly, and not given the observed ones, so they cannot be "
+            "imputed; use a distribution of single steps"
+        )
     drawing = model.is_drawn() if draw is None else draw
     exact = model.likelihood and not model.bounded
     if particles < 1 or (particles > 1 and not (drawing and exact)):

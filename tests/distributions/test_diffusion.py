@@ -11,6 +11,7 @@ from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
 from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
 from dvae.networks.denoising import ragged_cosine_basis
 from dvae.testing import FactorizationContract
+from dvae.testing.device import move, on_device
 
 COVARIANCE = torch.tensor([[1.0, 0.6], [0.6, 0.5]], dtype=torch.float64)
 LOCATION = torch.tensor([0.5, -1.0], dtype=torch.float64)
@@ -187,6 +188,19 @@ class TestItsEmissionReadsItsOwnPast(FactorizationContract):
         return freeze(dvae.DynamicalVAE(*pair, sizes, network=Recurrent(width=5), distributions={"p(x)": spec}))
 
 
+class TestItsEmissionIsTrainedByFlowMatching(FactorizationContract):
+    """The loss is declared a density here, so that every test of a density applies to it."""
+
+    training_steps = 20
+
+    def build(self, size):
+        pair, spec = ("p(w) p(x_t | x_{<t}, w)", "q(w | x_{1:T})"), FlowMatching(hidden=(4,), steps=3)
+        sizes = {"w": size, "x": size}
+        model = freeze(dvae.DynamicalVAE(*pair, sizes, network=Recurrent(width=5), distributions={"p(x)": spec}))
+        model.generator["x"].head.density = "exact"
+        return model
+
+
 class OneDistributionOfAllSteps(FactorizationContract):
     """Base of contracts of emissions that are drawn jointly."""
 
@@ -202,7 +216,17 @@ class OneDistributionOfAllSteps(FactorizationContract):
         assert model.sample(1, length=1)["x"].isfinite().all()
 
     def test_a_bound_stays_on_its_device(self):
-        pytest.skip("this test forecasts given past steps, which a distribution of all steps does not support")
+        """As in the contract, with draws in place of a forecast given past steps."""
+        model = self._model()
+        data = self._data(model)
+        with on_device() as traffic:
+            move(model)
+            device_data = {name: value.to("cuda") for name, value in data.items()}
+            for _ in range(2):
+                traffic.clear()
+                dvae.SequenceELBO().terms(model, device_data).bound.sum().backward()
+            assert not traffic.uploads
+            model.sample(2, length=4)
 
     def test_training_stays_finite(self):
         pytest.skip("this test forecasts given past steps, which a distribution of all steps does not support")
@@ -281,8 +305,11 @@ def test_missing_steps_and_padding_change_nothing_else(kind):
     value = run.values["x"]
     density = run.evaluate("x", value).exact_log_prob(value, steps=5)
     assert density.log_prob.shape == (2,)
+    for draw in (True, False):
+        with pytest.raises(ValueError, match="cannot be imputed"):
+            model.impute({"x": other, "s": s, "mask": mask}, draw=draw)
     with pytest.raises(ValueError, match="jointly, and not given some"):
-        model.impute({"x": other, "s": s, "mask": mask})
+        model.forecast({"x": x, "s": s}, 2)
 
 
 def test_a_predictor_forecasts_whole_futures():
