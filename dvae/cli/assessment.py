@@ -169,6 +169,7 @@ def evaluate(
     classifier: tuple[Path, ...] = (),
     several_futures: bool = False,
     windows_of: Expert[Paper | None] = None,
+    ensembles: bool = False,
     seed: int = 0,
     batch_size: Expert[int] = 32,
     out: Path | None = None,
@@ -202,6 +203,7 @@ def evaluate(
         several_futures: score only windows whose last observed pose is shared by another window, as GSPS's tables do.
             Without it, all windows are scored, as in DLow's.
         windows_of: score the windows of Human3.6M that the public code of a paper scores.
+        ensembles: add a row for the equal-weight mixture of runs that differ only in their seed.
         seed: seed of the draws.
         batch_size: number of windows forecast at once.
         out: file to write instead of evaluation.json in each run.
@@ -218,9 +220,8 @@ def evaluate(
         raise UsageError("--forecasts is for scores of forecasts, not for another --measure or for segments")
     if run and (external.protocol or source != AS_STORED):
         raise UsageError("the runs define the windows; leave --protocol and options for reading the data out")
-    scoring = ForecastScoring(
-        samples, log_score_particles, pose_prior, classifier, control, missing, failed, several_futures, windows_of
-    )
+    options = samples, log_score_particles, pose_prior, classifier, control, missing, failed
+    scoring = ForecastScoring(*options, several_futures, windows_of, ensembles)
     chosen = [name for name, options in (("angles", angles), ("quality", realism)) if options != type(options)()]
     if wrong := next((name for name in chosen if name != measure), None):
         raise UsageError(f"options of --measure {wrong} do not apply to --measure {measure}; leave them out")
@@ -282,6 +283,7 @@ class ForecastScoring:
     failed: bool = False
     several_futures: bool = False
     windows_of: Paper | None = None
+    ensembles: bool = False
 
 
 def _forecasts(
@@ -322,6 +324,7 @@ def _forecasts(
             f"--{inapplicable[0].replace('_', '-')} is for motion, and {data_set.path} is a table; leave it out"
         )
     models = {name: run.model for name, run in zip(loading.names(loaded), loaded, strict=True)}
+    models |= _mixtures(loaded) if scoring.ensembles else {}
     if clash := models.keys() & given.keys():
         raise UsageError(f"a run and a file of forecasts are both named {min(clash)}; rename the file")
     is_known = not loaded or loading.is_training_data(loaded[0], data_set)
@@ -339,6 +342,18 @@ def _forecasts(
     record = loading.record("evaluation", loaded[0], data_set) if loaded else "evaluation"
     subset = f"-{scoring.windows_of}" * bool(scoring.windows_of) + "-several-futures" * scoring.several_futures
     return result, f"{record}{scoring.control}{subset}{''.join(f'-with-{name}' for name in given)}"
+
+
+def _mixtures(loaded: Sequence[runs.Loaded]) -> dict[str, Ensemble]:
+    """Return the mixtures of runs that differ only in their seed, by the name of their row.
+
+    Raises:
+        UsageError: no run differs from another one only in its seed.
+    """
+    several = {name: [each.model for each in row] for name, row in loading.rows(loaded).items() if len(row) > 1}
+    if not several:
+        raise UsageError("--ensembles needs runs that differ only in their seed; each row has one seed")
+    return {f"{name}, mixture of {len(row)} seeds": Ensemble(row) for name, row in several.items()}
 
 
 def _measure(
@@ -518,11 +533,7 @@ def compare(
     windows = loading.windows_to_test(loaded[0], data_set, stride)
     rows = loading.rows(loaded)
     models: dict[str, Any] = {name: [each.model for each in row] for name, row in rows.items()}
-    if ensembles:
-        several = {name: row for name, row in models.items() if len(row) > 1}
-        if not several:
-            raise UsageError("--ensembles needs runs that differ only in their seed; each row has one seed")
-        models |= {f"{name}, mixture of {len(row)} seeds": Ensemble(row) for name, row in several.items()}
+    models |= _mixtures(loaded) if ensembles else {}
     result = compare_models(
         models,
         windows,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -66,8 +67,13 @@ def convert(
     recorded: float | None = None,
     skip_bad: bool = False,
     missing: Missing = False,
+    units: tuple[str, ...] = (),
+    prefix: bool = False,
 ) -> None:
     """Convert motion files: all clips to one file (--out motion.npz), or one file per clip to a folder.
+
+    Several files or folders are merged. They need the same joints and frames per second, which --onto and --fps give
+    them.
 
     Args:
         files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), or "simulated".
@@ -80,18 +86,21 @@ def convert(
         up: vertical axis of the files, instead of the detected one.
         recorded: frames per second of the files, if they state a wrong rate.
         skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
+        units: units of some of the files, such as a.bvh=cm b.npz=m, in m, cm, mm, in, or metres per unit.
+        prefix: start the names of clips with the name of their archive, or of the folder of their recording.
     """
     target = _skeleton(onto)
     if files in ((), (SIMULATED,)):
-        if metres or up or recorded:
-            raise UsageError("--metres, --up and --recorded correct what files state; simulated motion has no files")
+        if metres or up or recorded or units or prefix:
+            raise UsageError("--metres, --units, --up, --recorded and --prefix are for files, not simulated motion")
         people = motion.simulate() if fps is None else motion.simulate().resample(fps)
         people = people if target is None else reading.select_joints(people, onto=target)
         description = f"{len(writing.write_motion(out, people, format))} files"
     else:
-        corrections = {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad, "missing": missing}
+        corrections: Any = {"units": _units(units, files), "prefix": prefix}
+        corrections |= {"metres": metres, "up": up, "recorded": recorded, "skip_bad": skip_bad, "missing": missing}
         paths = [Path(file) for file in files]
-        description = writing.convert(paths, out, format, fps, target, jobs, **corrections)  # type: ignore[arg-type]
+        description = writing.convert(paths, out, format, fps, target, jobs, **corrections)
     ERROR.print(f"wrote {out}: {description}", markup=False)
 
 
@@ -119,6 +128,25 @@ def _read_motion(
     if file == SIMULATED:
         return motion.simulate()
     return motion.read_motion(file, skip_bad=skip_bad, metres=metres, up=up, fps=recorded, missing=missing)
+
+
+def _units(texts: Sequence[str], files: Sequence[str]) -> dict[Path, float]:
+    """Return metres per unit of the files in texts such as a.bvh=cm.
+
+    Raises:
+        UsageError: a text names none of the files, or no unit.
+    """
+    lengths = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+    units = {}
+    for text in texts:
+        file, _, unit = text.rpartition("=")
+        try:
+            units[Path(file)] = lengths[unit] if unit in lengths else float(unit)
+        except ValueError:
+            raise UsageError(f"--units {text}: expected FILE={', FILE='.join(lengths)} or FILE=METRES") from None
+        if file not in files:
+            raise UsageError(f"--units {text}: {file or 'no file'} is not among the files: {', '.join(files)}")
+    return units
 
 
 def _skeleton(name: str | None) -> motion.Skeleton | None:

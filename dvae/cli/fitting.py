@@ -28,7 +28,7 @@ from ..models.method import LatentMethod
 from ..models.motion.trajectories import TrajectoryMethod
 from ..models.registry import methods, metric_models
 from ..motion.data.dataset import SIMULATED
-from ..motion.data.protocols import Representation
+from ..motion.data.protocols import Representation, RootMotion
 from ..motion.segments.dataset import Segmentation
 from ..options import Amount, Frames, Share
 from ..runs import directory as runs
@@ -161,6 +161,8 @@ class DataOptions(CutOptions):
         protocol: protocol that cuts windows; by default the protocol of the skeleton.
         representation: input of the model: positions of joints, or rotations of joints in this form, which keep the
             lengths of bones.
+        root: drop the root of every frame, keep it relative to the first frame, or model its travel: velocities and
+            poses relative to its heading, which forecasts add up.
         cut: for motion-latent: use gait cycles as segments, or whole clips of 0.3 to 3 seconds.
         scaling: for motion-latent: encode rotations relative to the identity, or relative to their mean in units of
             their standard deviation.
@@ -176,6 +178,7 @@ class DataOptions(CutOptions):
     data: str = SIMULATED
     protocol: ProtocolName | None = None
     representation: Expert[Representation] = "positions"
+    root: RootMotion | None = None
     missing: Missing = False
     cut: Expert[Segmentation] = "gait"
     scaling: Expert[Literal["identity", "deviation"]] = "identity"
@@ -202,7 +205,7 @@ class DataOptions(CutOptions):
 
 
 OF_KINDS = {
-    "motion": ("protocol", "representation", "missing", "skip_bad"),
+    "motion": ("protocol", "representation", "root", "missing", "skip_bad"),
     "segments": ("cut", "scaling", "warped", "bodies", "body", "betas", "hold_out", "skip_bad"),
     "panel": (
         *(field.name for field in fields(ColumnOptions)),

@@ -70,6 +70,7 @@ def forecast(
     failed: Expert[Failed] = False,
     figure: Path | None = None,
     beyond: bool = False,
+    blend: int = 0,
 ) -> None:
     """Forecast the test windows, or those of one clip or sequence, many times each.
 
@@ -79,9 +80,12 @@ def forecast(
     For motion, an npz contains, in metres, `forecasts` (samples, windows, horizon, joints, 3), `observed` and `truth`
     (windows, frames, joints, 3). Missing joints are NaN. It also contains `split`, `clip` and `start` of each window,
     the skeleton, and `emission`, which is "drawn" or "mean". `dvae animate` plays it, and `dvae.motion.Forecasts.load`
-    reads it. A .bvh file contains the first future of the window that moves most. A name without a suffix is a new
-    folder with a BVH file for every window and future. BVH files contain the observed frames and then the future, at
-    the place of the clip if the protocol keeps the root's path.
+    reads it. `largest_steps` are the largest distances of a joint from the last observed frame to the next one, in
+    futures and in the truth, and `blend` is the number of blended frames.
+
+    A .bvh file contains the first future of the window that moves most. A name without a suffix is a new folder with a
+    BVH file for every window and future. BVH files contain the observed frames and then the future, at the place of the
+    clip if the protocol keeps the root's path (`dvae fit --root travel`).
 
     With --joints or --paths, motions start at the first pose of one window and follow these paths.
 
@@ -99,13 +103,17 @@ def forecast(
         data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         figure: save a figure of the first window's futures.
         beyond: for a table: forecast the steps after its last row with a target, using covariates of later rows.
+        blend: for motion: number of first frames that pass from the observed motion to the future, so that no joint
+            jumps. Do not score blended forecasts.
     """
+    at_least(0, blend=blend)
     at_least(1, samples=samples, horizon=horizon)
     at_least(0, window=along.window)
     check_files(out, figure)
     loaded, data_set = forecaster(run, data, missing, failed)
     if loaded.config.kind == "panel":
         of_motion = {"fix": bool(fix), "missing": missing, "draw-emission": draw_emission is not None}
+        of_motion["blend"] = blend > 0
         of_motion |= {name: value != getattr(Paths, name) for name, value in vars(along).items()}
         if inapplicable := [name for name, is_given in of_motion.items() if is_given]:
             raise UsageError(f"--{inapplicable[0]} is for motion, and {run} was fitted on a table; leave it out")
@@ -116,8 +124,10 @@ def forecast(
     windows, samples = windows_of(data_set, clip), samples or SAMPLES
     if along != Paths():
         check_files(out, figure, ".npz")
-        if horizon or fix or draw_emission is not None:
-            raise UsageError("--horizon, --fix and --draw-emission do not apply to motion along --joints or --paths")
+        if horizon or fix or draw_emission is not None or blend:
+            raise UsageError(
+                "--horizon, --fix, --draw-emission and --blend do not apply to motion along --joints or --paths"
+            )
         _follow_paths(loaded, windows, along, samples, seed, out, figure)
         return
     suffix = out.suffix.lower()
@@ -129,10 +139,11 @@ def forecast(
         draw_emission = loaded.model.is_drawn()
     futures = draw_futures(loaded, windows, selected, samples, seed, horizon, fix, draw_emission)
     context, protocol = "", windows.protocol
+    blended = futures.blended(blend) if blend else futures
+    written, unblended = (each.window(0, 1) if suffix == ".bvh" else each for each in (blended, futures))
     if suffix == ".npz":
-        futures.save(out)
+        written.save(out)
     else:
-        written = futures.window(0, 1) if suffix else futures
         motion.write_motion(
             out, (written if protocol.root == "drop" else _in_world(written, windows, selected)).motion(), "bvh"
         )
@@ -144,7 +155,34 @@ def forecast(
         f"wrote {out}: {description} of {frames} frames for each of {len(selected)} windows{context}, "
         f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
     )
-    _save_futures(futures, figure)
+    ERROR.print(f"largest step of a joint to the first future frame: {_steps(written, unblended, 1)}")
+    if blend > 1:
+        ERROR.print(f"largest step of a joint in {blend} blended frames: {_steps(written, unblended, blend)}")
+    if protocol.root != "drop":
+        ERROR.print(_travel(written))
+    _save_futures(blended, figure)
+
+
+def _steps(futures: motion.Forecasts, unblended: motion.Forecasts, frames: int) -> str:
+    """Return the largest step of a joint in the first frames, before and after blending, and in the true motion."""
+    (step, true_step), earlier = futures.largest_steps(frames), unblended.largest_steps(frames)[0]
+    note = f" ({1000 * earlier:.0f} mm before blending)" if futures.blend else ""
+    return f"{1000 * step:.0f} mm{note}, in the true motion {1000 * true_step:.0f} mm"
+
+
+def _travel(futures: motion.Forecasts) -> str:
+    """Return how far and how fast the root moves over the ground in futures, and in the true motion."""
+    skeleton, frames, descriptions = futures.skeleton, futures.truth.shape[1], []
+    level = [axis for axis in range(3) if axis != skeleton.vertical]
+    for frames_after in (futures.forecasts[:, :, :frames], futures.truth[None]):
+        path = np.insert(frames_after, 0, futures.observed[:, -1], 2)[..., skeleton.root, level]
+        path = path[np.isfinite(path).all((2, 3))]
+        distance = np.linalg.norm(path[:, -1] - path[:, 0], axis=-1)
+        speed = skeleton.fps * np.linalg.norm(np.diff(path, axis=1), axis=-1)
+        means = (each.mean() if len(path) else np.nan for each in (distance, speed))
+        descriptions.append("{:.2f} m at {:.2f} m/s".format(*means))
+    future, true = descriptions
+    return f"the root travels {future}, in the true motion {true} (means over {frames} frames)"
 
 
 def _follow_paths(

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import pi
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from .. import files
 from .data.clips import Clip, MotionSet
 from .files.archive import holds, write_arrays
 from .files.arrays import read_arrays
+from .geometry import kinematics
+from .geometry.rotations import from_matrix, to_matrix
 from .geometry.skeleton import FIELDS, Skeleton
 
 
@@ -36,6 +40,8 @@ class Forecasts:
         truth: (N, F, J, 3), true frames after the observed ones, NaN where a joint was missing; F is at most H.
         emission: "drawn" if futures include the noise of the emission, "mean" if they are its means given draws of the
             latents, "" if unknown.
+        blend: number of first frames that `blended` changed; 0 if these are the model's own forecasts. Scores are for
+            the model's own forecasts.
 
     Raises:
         ValueError: the shapes do not match each other or the skeleton, or an array is empty.
@@ -49,6 +55,7 @@ class Forecasts:
     observed: np.ndarray
     truth: np.ndarray
     emission: str = ""
+    blend: int = 0
 
     def __post_init__(self) -> None:
         windows, joint = len(self.keys), (self.skeleton.joints, 3)
@@ -78,8 +85,59 @@ class Forecasts:
             samples: number of futures to keep; None for all.
         """
         row = slice(n, n + 1)
-        future = self.forecasts[:samples, row]
-        return Forecasts(self.skeleton, self.keys[row], future, self.observed[row], self.truth[row], self.emission)
+        future, keys = self.forecasts[:samples, row], self.keys[row]
+        return replace(self, keys=keys, forecasts=future, observed=self.observed[row], truth=self.truth[row])
+
+    def largest_steps(self, frames: int = 1) -> tuple[float, float]:
+        """Return the largest distance in metres that a joint moves between frames, in the futures and in the truth.
+
+        Args:
+            frames: number of steps after the last observed frame; the first one is the seam of past and future.
+
+        Returns:
+            The distances, NaN if the joints of no step were observed.
+        """
+        future, true = (
+            np.linalg.norm(np.diff(np.insert(each[:, :, :frames], 0, self.observed[:, -1], 2), axis=2), axis=-1)
+            for each in (self.forecasts, self.truth[None])
+        )
+        largest = (float(np.nanmax(distances, initial=-1)) for distances in (future, true))
+        first, second = (np.nan if each < 0 else each for each in largest)
+        return first, second
+
+    def blended(self, frames: int) -> Forecasts:
+        """Return futures whose first frames continue the observed motion, without a jump of any joint.
+
+        The first frame becomes the one that the last two observed frames predict at constant velocity. The difference
+        to the future, a displacement of the root and a rotation of each bone, is applied to the following frames too,
+        with weights that fall from 1 to 0 along a cosine. Lengths of bones change gradually from the observed ones to
+        those of the future. A joint that was missing in the last two observed frames starts as in the future.
+
+        Args:
+            frames: number of first frames to change.
+
+        Raises:
+            ValueError: the number is not between 1 and the number of frames, or the futures are blended already.
+        """
+        if self.blend or not 1 <= frames <= self.forecasts.shape[2]:
+            raise ValueError(
+                f"cannot blend {frames} frames: expected 1 to {self.forecasts.shape[2]} frames, of forecasts that are "
+                f"not blended yet (these have {self.blend} blended frames)"
+            )
+        skeleton, future = self.skeleton, torch.from_numpy(self.forecasts[:, :, :frames]).double()
+        last, before = (torch.from_numpy(self.observed[:, n]).double() for n in (-1, max(-2, -self.observed.shape[1])))
+        last, expected = (torch.where(x.isfinite(), x, future[:, :, 0])[:, :, None] for x in (last, 2 * last - before))
+        weight = (0.5 + 0.5 * torch.cos(pi / frames * torch.arange(frames, dtype=torch.float64)))[:, None, None]
+        limbs, past_limbs, expected_limbs = (skeleton.limbs(x.flatten(-2)) for x in (future, last, expected))
+        first, towards = (torch.nn.functional.normalize(x, dim=-1) for x in (limbs[:, :, :1], expected_limbs))
+        turn = from_matrix(kinematics.swing(first, towards), "vector")
+        lengths = torch.lerp(limbs.norm(dim=-1), past_limbs.norm(dim=-1), weight[..., 0])
+        limbs = (to_matrix(weight * turn, "vector") @ torch.nn.functional.normalize(limbs, dim=-1)[..., None])[..., 0]
+        limbs = lengths[..., None] * limbs
+        root = (future + weight * (expected - future[:, :, :1]))[..., skeleton.root, :]
+        joints = skeleton.with_root(skeleton.ends(limbs).unflatten(-1, (-1, 3))) + root[..., None, :]
+        changed = joints.numpy().astype(self.forecasts.dtype)
+        return replace(self, forecasts=np.concatenate([changed, self.forecasts[:, :, frames:]], 2), blend=frames)
 
     def motion(self) -> MotionSet:
         """Return one clip per future, including its observed frames.
@@ -102,14 +160,15 @@ class Forecasts:
     def save(self, path: str | Path) -> None:
         """Write an npz of plain arrays.
 
-        Its members are `forecasts`, `observed` and `truth`; `emission` if known; and `split`, `clip` and `start` of
-        each window. The skeleton has the fields of its JSON file: `name`, `joint_names`, `parents`, `joints_left`,
-        `joints_right`, `up_axis`, `fps`.
+        Its members are `forecasts`, `observed` and `truth`; `emission` if known; `blend`; `largest_steps` after the
+        last observed frame; and `split`, `clip` and `start` of each window. The skeleton has the fields of its JSON
+        file: `name`, `joint_names`, `parents`, `joints_left`, `joints_right`, `up_axis`, `fps`.
 
         Args:
             path: path of the file.
         """
         arrays = {"forecasts": self.forecasts, "observed": self.observed, "truth": self.truth}
+        arrays |= {"blend": np.array(self.blend), "largest_steps": np.array(self.largest_steps())}
         _write(path, arrays, self.keys, self.skeleton, self.emission)
 
     @classmethod
@@ -135,7 +194,8 @@ class Forecasts:
             motions = [arrays[name] for name in ("forecasts", "observed", "truth")]
             if any(array.dtype.kind != "f" for array in motions):
                 raise ValueError("expected real numbers in forecasts, observed and truth")
-            return cls(skeleton, keys, motions[0], motions[1], motions[2], str(arrays.get("emission", "")))
+            emission, blend = str(arrays.get("emission", "")), int(arrays.get("blend", 0))
+            return cls(skeleton, keys, motions[0], motions[1], motions[2], emission, blend)
         except KeyError as error:
             raise ValueError(f"{path} has no member {error}; write it with `dvae forecast`") from error
         except (FloatingPointError, TypeError, ValueError) as error:

@@ -34,7 +34,7 @@ from ..options import Count, Range, require
 from .batch import AnyBatch
 from .conditional import Conditional, like
 from .gaussian import GaussianFilter, is_linear_gaussian
-from .particles import Particles, effective_size, hidden_data, is_windowed, log_mean, mixture, reads_ahead
+from .particles import Particles, effective_size, hidden_data, is_windowed, log_mean, moments_of_mixture, reads_ahead
 from .rollout import Rollout
 
 PARTICLES = 100
@@ -147,7 +147,7 @@ class Prediction:
             with suppress(NotImplementedError, AttributeError):  # some distributions have no formula
                 variances = conditional.distribution(parameters).variance
             shape = log_weights.shape
-            moments[name] = mixture(means.unflatten(0, shape), variances.unflatten(0, shape), log_weights)
+            moments[name] = moments_of_mixture(means.unflatten(0, shape), variances.unflatten(0, shape), log_weights)
         return moments
 
     def pit(self, name: str, value: Tensor, uniform: Tensor) -> Tensor:

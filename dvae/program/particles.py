@@ -304,7 +304,9 @@ class Particles:
     def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
         """Return moments (B, D) of each latent, and of states their probabilities, `lag` steps ago given all data."""
         values = {name: value.unflatten(0, self.log_weights.shape) for name, value in self.latents(lag).items()}
-        moments = {name: mixture(each, torch.zeros_like(each), self.log_weights) for name, each in values.items()}
+        moments = {
+            name: moments_of_mixture(each, torch.zeros_like(each), self.log_weights) for name, each in values.items()
+        }
         mean, variance = ({name: pair[i] for name, pair in moments.items()} for i in range(2))
         return {"mean": mean, "variance": variance, "states": self.state_probabilities(lag)}
 
@@ -559,7 +561,7 @@ def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
     return (particle * batch + torch.arange(batch, device=identity.device)).flatten()
 
 
-def mixture(means: Tensor, variances: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
+def moments_of_mixture(means: Tensor, variances: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean and variance (B, D) of a mixture.
 
     Args:

@@ -299,6 +299,11 @@ def read_samples(path: str | os.PathLike[str], observed: int | None = None, axes
 
 def _of_arrays(arrays: Mapping[str, np.ndarray], observed: int | None) -> ForecastSamples:
     """Return samples from the members of an npz file."""
+    if (blend := arrays.get("blend")) is not None and blend.any():
+        raise ValueError(
+            f"its first {blend} steps are blended with the observed ones, so they are not the model's own forecasts; "
+            "write the file without `dvae forecast --blend` to score it"
+        )
     values, sequence = (next((arrays[n] for n in names if n in arrays), None) for names in NAMES.values())
     if values is None or values.dtype.kind not in "fiu":
         raise ValueError(

@@ -86,7 +86,7 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
     def resolve_defaults(self, data: Any) -> Self:
         """Return the method with unset options chosen for the skeleton, or for data other than joint positions."""
         schema = Schema.of(data)
-        if isinstance(schema, Poses) and schema.protocol.representation == self.representation:
+        if isinstance(schema, Poses) and schema.representation == self.representation:
             return super().resolve_defaults(schema)
         return self.with_presets({**self.presets[""], "heading": False})
 

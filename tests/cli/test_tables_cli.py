@@ -268,7 +268,15 @@ def test_runs_are_compared_criticised_resumed_and_swept(table_runs, table, tmp_p
     assert not OF_MOTION.findall(captured.out)
     assert main(["resume", both[0], "--steps", "3"]) == 0
     out = str(tmp_path / "sweep")
-    assert main(["sweep", "autoregressive", "--out", out, "--seeds", "0", "--data", str(table), *SMALL, *OPTIONS]) == 0
+    data = ["--data", str(table), *SMALL, *OPTIONS]
+    assert main(["sweep", "autoregressive", "--out", out, "--seeds", "0", "1", *data]) == 0
+    swept = [f"{out}/autoregressive-seed{seed}" for seed in range(2)]
+    mixed = ["evaluate", *swept, "--ensembles", "--samples", "4", "--out", str(tmp_path / "mixed.json")]
+    assert main(mixed) == 0
+    rows = dvae.Evaluation.load(tmp_path / "mixed.json").rows
+    assert "autoregressive, mixture of 2 seeds" in rows
+    assert {row.samples for name, row in rows.items() if name.startswith("autoregressive")} == {4}
+    assert "needs runs that differ only in their seed" in failure(capsys, "evaluate", *both, "--ensembles", code=2)
     assert dvae.load(tmp_path / "sweep" / "autoregressive-seed0").schema.cut.horizon == 3
     assert "which is of a table" in failure(capsys, "animate", both[0], "--out", tmp_path / "a.html")
 

@@ -167,7 +167,8 @@ def defect(clip: Clip, skeleton: Skeleton, missing: bool = False) -> str | None:
         unit = "millimetres" if extent >= 300 else "centimetres" if extent >= 30 else "another unit"
         return (
             f"{label} shows a person of {extent:.4g} m (median over frames of the body's largest extent, "
-            f"expected {SMALLEST} to {TALLEST} m): it looks like {unit}; convert the positions to metres"
+            f"expected {SMALLEST} to {TALLEST} m): it looks like {unit}; convert the positions to "
+            "metres, or give the unit of the file (`metres=`, `--metres`, `--units`)"
         )
     return None
 

@@ -10,7 +10,7 @@ from ...options import check
 from ..files import read_motion
 from ..files.reading import select_joints
 from .clips import MotionSet
-from .protocols import PROTOCOLS, Poses, Protocol, Representation, Windows, named_protocol, windows
+from .protocols import PROTOCOLS, Poses, Protocol, Representation, RootMotion, Windows, named_protocol, windows
 from .simulator import simulate
 
 SIMULATED = "simulated"
@@ -102,6 +102,7 @@ class MotionData:
         skip_bad: bool = False,
         missing: bool = False,
         representation: Representation | None = None,
+        root: RootMotion | None = None,
     ) -> Self:
         """Read a motion file, or simulate motion.
 
@@ -112,7 +113,7 @@ class MotionData:
                 them.
             skip_bad: leave out unusable clips instead of raising an error.
             missing: keep clips in which joints are missing (NaN) in some frames.
-            representation: input of the models; overrides the representation of the protocol.
+            representation, root: input of the models, and treatment of the root, in place of the protocol's.
 
         Returns:
             Clips, divided into splits, with their protocol.
@@ -126,7 +127,8 @@ class MotionData:
         if isinstance(protocol, str):
             protocol = named_protocol(protocol)
         protocol = protocol or default_protocol(clips)
-        protocol = replace(protocol, representation=representation or protocol.representation)
+        representation = representation or protocol.representation
+        protocol = replace(protocol, representation=representation, root=root or protocol.root)
         split = apply_splits(clips, protocol)
         tested = {clip.name for clip in split if clip.split == "test"}
         partly = len(split) > len(clips) > 1  # otherwise whole clips form the test split

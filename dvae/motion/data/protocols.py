@@ -38,12 +38,14 @@ from ...data.views import View
 from ...options import Amount, Frames, Range, check, nearest, tuples
 from ..geometry.rotations import continuous, from_matrix, to_matrix
 from ..geometry.skeleton import Skeleton, rotate_about_up
-from ..geometry.views import ROTATIONS, Rotations
+from ..geometry.views import ROTATIONS, Rotations, Travel
 from .actions import ACTION, GROUP, human36m_label
 from .clips import Clip, MotionSet
 
 Representation = Literal["positions", "6d", "quaternion", "vector"]
 """Input of the models: positions of joints, or rotations in a form of `dvae.motion.geometry.rotations`."""
+RootMotion = Literal["drop", "relative", "travel"]
+"""What windows keep of the root, as in `Protocol`."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ class Protocol:
             drawn, for training and for test.
         root: "drop": every frame is relative to its own pelvis, which is then removed, D = 3 (J - 1). "relative": all
             frames are relative to one position, the first observed pelvis of the window. Global motion is then kept,
-            and D = 3 J.
+            and D = 3 J. "travel": the same windows, but models see velocities of the root and poses relative to its
+            heading (`dvae.motion.geometry.views.Travel`), so forecasts continue the path.
         multimodal_threshold: distance in metres. If the last observed poses of test windows are closer than this, the
             futures of all these windows are possible futures of each.
         split_by: "split", or the label that assigns clips to splits.
@@ -72,7 +75,8 @@ class Protocol:
             `dvae.motion.geometry.rotations`. Windows and scores use positions in either case.
 
     Raises:
-        ValueError: a number of frames or a stride is below 1, or both heading and rotate are set.
+        ValueError: a number of frames or a stride is below 1, both heading and rotate are set, or root is "travel" with
+            a single observed frame, which has no velocity.
     """
 
     name: str
@@ -81,7 +85,7 @@ class Protocol:
     fps: Annotated[float, Range(0.001, 100_000)]
     train_stride: Frames
     test_stride: Frames
-    root: Literal["drop", "relative"] = "drop"
+    root: RootMotion = "drop"
     multimodal_threshold: Amount = 0.5
     split_by: str = "split"
     train: tuple[str, ...] = ("train",)
@@ -100,6 +104,12 @@ class Protocol:
         if self.heading and self.rotate:
             raise ValueError(
                 f"protocol {self.name}: `heading` fixes the direction that `rotate` draws at random; set only one"
+            )
+
+        if self.root == "travel" and self.observed < 2:
+            raise ValueError(
+                f"protocol {self.name}: root='travel' needs the velocity of the last observed frame, so at least 2 "
+                "observed frames, got 1; choose another protocol, or root='relative'"
             )
 
     @property
@@ -189,7 +199,7 @@ class Poses(Schema):
             length: number of frames T; None for the length of the protocol.
         """
         view = cls._view(protocol, skeleton)
-        size = view.size if isinstance(view, Rotations) else 3 * (skeleton.joints - (protocol.root == "drop"))
+        size = view.size if isinstance(view, Rotations | Travel) else 3 * (skeleton.joints - (protocol.root == "drop"))
         return cls({"x": size}, length or protocol.length, protocol.observed, skeleton=skeleton, protocol=protocol)
 
     @classmethod
@@ -206,15 +216,25 @@ class Poses(Schema):
             SchemaError: the data have no schema of poses, or another representation.
         """
         schema = super().of(data, who)
-        if (actual := schema.protocol.representation) != representation:
+        if (actual := schema.representation) != representation:
+            form, root = schema.protocol.representation, schema.protocol.root
+            advice = [f"whose representation is {representation} (--representation)"] * (form != representation)
+            advice += ["whose root is not 'travel' (--root)"] * (root == "travel")
             raise SchemaError(
                 f"{who} reads {_describe(representation)}, but under this protocol models see {_describe(actual)}; "
-                f"choose a protocol whose representation is {representation} (--representation)"
+                f"choose a protocol {' and '.join(advice)}"
             )
         return schema
 
+    @property
+    def representation(self) -> str:
+        """Input of the models: the protocol's representation, after "travel and " if models see the root's travel."""
+        return "travel and " * (self.protocol.root == "travel") + self.protocol.representation
+
     @staticmethod
     def _view(protocol: Protocol, skeleton: Skeleton) -> View:
+        if protocol.root == "travel":
+            return Travel(skeleton, protocol.representation)
         if protocol.representation == "positions":
             return View()
         return Rotations(skeleton, protocol.representation, protocol.root == "relative")
@@ -233,8 +253,9 @@ class Poses(Schema):
     @property
     @override
     def windows(self) -> Poses:
-        protocol, skeleton = replace(self.protocol, representation="positions"), replace(self.skeleton, rest=())
-        return self.from_data(protocol, skeleton, self.length)
+        root: RootMotion = "drop" if self.protocol.root == "drop" else "relative"
+        protocol = replace(self.protocol, representation="positions", root=root)
+        return self.from_data(protocol, replace(self.skeleton, rest=()), self.length)
 
     @property
     def frames(self) -> int:
@@ -256,7 +277,9 @@ class Poses(Schema):
 
 
 def _describe(representation: str) -> str:
-    return "positions of joints" if representation == "positions" else f"rotations of joints as {representation}"
+    form = representation.removeprefix("travel and ")
+    travel = "the travel of the root and " * (form != representation)
+    return travel + ("positions of joints" if form == "positions" else f"rotations of joints as {form}")
 
 
 def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int | None = None) -> Windows:

@@ -23,7 +23,7 @@ from ..data.clips import Clip, MotionSet
 from ..geometry.skeleton import HUMAN36M, HUMAN36M_KEPT, HUMANEVA, Skeleton, brief, is_name, text_of
 from .archive import LARGEST, archive, write_arrays
 from .recording import MOST_PLACES, MOST_TEXT, Recording, check_joints
-from .world import orientation_warning
+from .world import check_unit, orientation_warning
 
 ROTATIONS = ".rotations"
 """Ending of the names of members that contain the rotations of a clip."""
@@ -62,6 +62,7 @@ def read_archive(
     Args:
         joints: indices of the skeleton's joints in a file with more joints, such as `HUMAN36M_KEPT`.
     """
+    check_unit(metres)
     unread = _read_clips(path)
     if skeleton is None:
         skeleton, indices = _skeleton_of(path, unread, joints)

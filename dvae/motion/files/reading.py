@@ -382,7 +382,8 @@ class Collected:
                 if names
             ]
             return (
-                f"{path}: {' and '.join(differences)}, unlike {self._first}; select common joints with joints= or onto="
+                f"{path}: {' and '.join(differences)}, unlike {self._first}; select common joints with onto= "
+                "(`dvae data convert --onto`) or joints="
             )
         if first.names != skeleton.names or (first.parents != skeleton.parents and clip.rotations is not None):
             return f"{path}: its joints have another order or tree than in {self._first}; give onto="
@@ -396,7 +397,7 @@ class Collected:
         if is_known.any() and not 1 / LIKE < size < LIKE:
             return (
                 f"{path}: its body is {size:.2g} times as large as in {self._first}; if it is in "
-                "another unit, read it separately with metres="
+                "another unit, give its own (`dvae data convert --units FILE=UNIT`, `metres=` in Python)"
             )
         other, rest = np.array(first.rest), np.array(skeleton.rest)
         self._same_rest &= other.shape == rest.shape and not (np.abs(other - rest) > SAME).any()
@@ -440,6 +441,7 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
     """
     collected, clips = Collected(name), []
     skipped: list[tuple[str, str, str]] = []
+    paths: dict[tuple[str, str], Path] = {}
     first, up = sets[0][0], sets[0][1].skeleton.up
     for path, motion in sets:
         if motion.skeleton.up != up:
@@ -448,6 +450,11 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
         for clip in motion:
             if reason := collected.add(path, clip, motion.skeleton):
                 raise ValueError(reason)
+            if (earlier := paths.setdefault(clip.key, path)) != path:
+                raise ValueError(
+                    f"the clip {'/'.join(clip.key)} occurs twice, in {earlier} and {path}; start names of clips with "
+                    "the name of their archive or folder, with `dvae data convert --prefix`"
+                )
             clips.append(clip)
     return collected.motion(clips, skipped=skipped, missing=any(motion.missing for _, motion in sets))
 

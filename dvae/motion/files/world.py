@@ -138,6 +138,12 @@ class World:
         return f"unit {self.unit} ({self.metres:.4g} m), {self.up} up{rotation}{self.axis if rotation else ''}"
 
 
+def check_unit(metres: float | None) -> None:
+    """Raise an error if a number is not the length of a unit in metres."""
+    if metres is not None and not 1e-6 < metres < 1e6:
+        raise ValueError(f"`metres` must be the length of a unit in metres, such as 0.01 for centimetres, got {metres}")
+
+
 def infer_world(recordings: Mapping[str, Recording], metres: float | None = None, up: str | None = None) -> World:
     """Return unit and axes of recordings that belong together: from the files, or from most people in them.
 
@@ -151,8 +157,7 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
     """
     if up not in (None, "y", "z"):
         raise ValueError(f"`up` must be 'y' or 'z', got {up!r}")
-    if metres is not None and not 1e-6 < metres < 1e6:
-        raise ValueError(f"`metres` must be the length of a unit in metres, such as 0.01 for centimetres, got {metres}")
+    check_unit(metres)
     units: dict[tuple[str, float], str] = {} if metres is None else {("as given", metres): ""}
     unknown = []
     for name, recording in recordings.items() if metres is None else ():
@@ -163,10 +168,11 @@ def infer_world(recordings: Mapping[str, Recording], metres: float | None = None
     if not units:
         raise ValueError(unknown[0])
     if len({length for _, length in units}) > 1:
-        ((first, _), first_name), ((other, _), other_name), *_ = units.items()
+        (first, first_name), (other, other_name), *_ = units.items()
         raise ValueError(
-            f"{first_name} seems to be in {first}, {other_name} in {other}; if all have the same unit, pass its length "
-            "in metres (`metres`)"
+            f"{first_name} seems to have the unit {first[0]} ({first[1]:.4g} m), {other_name} {other[0]} "
+            f"({other[1]:.4g} m); if all have the same unit, pass its length in metres (`metres`); otherwise give the "
+            f"unit of each file or folder (`dvae data convert --units FILE={first[1]:.4g}`)"
         )
     axis, upwards = (up, True) if up else Counter(map(upright, recordings.values())).most_common(1)[0][0]
     return World(*next(iter(units)), axis, upwards)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import chain, count
@@ -15,7 +15,7 @@ import numpy as np
 
 from ... import files
 from ...inference.evaluation.result import progress_bar
-from ..data.clips import Clip, MotionSet
+from ..data.clips import Clip, MotionSet, extents
 from ..geometry.skeleton import Skeleton, brief
 from .arrays import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
 from .bvh import write_bvh
@@ -153,11 +153,13 @@ def convert(
     recorded: float | None = None,
     skip_bad: bool = False,
     missing: bool = False,
+    units: Mapping[Path, float] | None = None,
+    prefix: bool = False,
 ) -> str:
     """Convert the motion of files or folders, clip by clip, on several cores.
 
     Args:
-        sources: files and folders, as for `read_motion`; archives of clips are joined, but not mixed with other kinds.
+        sources: files and folders, as for `read_motion`.
         out: file or folder, as for `write_motion`.
         format: output format.
         fps: output frames per second; default: the rate of the files.
@@ -167,9 +169,11 @@ def convert(
         recorded: true frames per second of the files, if the files state a wrong rate.
         skip_bad: leave out unusable clips.
         missing: keep clips in which joints are missing (NaN) in some frames.
+        units: metres per unit of some sources; `metres` is for the others.
+        prefix: start the names of clips with the name of their archive, or of the folder of their recording.
 
     Returns:
-        A summary in words.
+        A summary in words, with the unit of each source.
 
     Raises:
         FileNotFoundError, ValueError, OSError: same as `read_motion` and `write_motion`.
@@ -179,24 +183,27 @@ def convert(
     format = format_of(out, format)
     files_of_sources = [_files_of(source, len(sources) > 1) for source in sources]
     files = list(chain.from_iterable(files_of_sources))
-    if archives := [source for source, inner in zip(sources, files_of_sources, strict=True) if not inner]:
-        if files:
-            raise ValueError(
-                f"{archives[0]} is an archive of clips and {files[0].path} is a recording; convert each kind alone, "
-                "then join the resulting archives"
-            )
-        options: Any = {"metres": metres, "up": up, "fps": recorded, "missing": missing}
-        motions = [read_motion(source, skip_bad=skip_bad, onto=onto, **options) for source in sources]
-        motion = motions[0] if len(motions) == 1 else joined_motion([*zip(sources, motions, strict=True)], out.stem)
-        motion = motion if fps is None else motion.resample(fps)
+    if units or prefix or not all(files_of_sources):
+        options: Any = {"up": up, "fps": recorded, "missing": missing, "skip_bad": skip_bad, "onto": onto}
+        motions: list[tuple[Path, MotionSet]] = []
+        notes = []
+        for source, inner in zip(sources, files_of_sources, strict=True):
+            unit = (units or {}).get(source, metres)
+            motion = read_motion(source, metres=unit, **options)
+            motion = motion if fps is None or fps == motion.skeleton.fps else motion.resample(fps)
+            size = float(np.median([np.median(extents(clip.positions).max(1)) for clip in motion]))
+            assumed = f"unit {'metres' if unit is None else 'as given'} ({unit or 1:.4g} m), a person of {size:.2f} m"
+            notes.append(f"{source}: " + "; ".join(filter(None, [assumed * (not inner), motion.interpretation])))
+            motions.append((source, _renamed(motion, source, sources, prefix, archive=not inner)))
+        motion = motions[0][1] if len(motions) == 1 else joined_motion(motions, out.stem)
         paths = write_motion(out, motion, format)
-        return f"{len(motion)} clips in {len(paths)} files; {len(motion.skipped)} skipped"
+        return f"{len(motion)} clips in {len(paths)} files; {len(motion.skipped)} skipped; {'; '.join(notes)}"
     if out.suffix and format != "npz" and len(files) > 1:
         raise ValueError(f"{out}: {format} stores one clip per file, but there are {len(files)}; give a folder")
     keys = [(file.split, file.name) for file in files]
     if len(set(keys)) < len(keys):
         repeated = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"two files have the clip name {'/'.join(repeated)}; put them into folders of different names")
+        raise ValueError(f"two files have the clip name {'/'.join(repeated)}; pass --prefix")
     world = infer_world(sampled(files, skip_bad), metres, up)
     reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, output_fps=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
@@ -234,9 +241,24 @@ def convert(
 def _files_of(source: Path, several: bool) -> list[File]:
     """Return the files of a source; with several sources, the folder name becomes part of the split."""
     files = find_files(source)
-    if several and source.is_dir():
-        return [replace(f, split=source.name if f.split == "all" else f"{source.name}/{f.split}") for f in files]
-    return files
+    return [replace(file, split=_split(file.split, source, several)) for file in files]
+
+
+def _split(split: str, source: Path, several: bool) -> str:
+    if not (several and source.is_dir()):
+        return split
+    return source.name if split == "all" else f"{source.name}/{split}"
+
+
+def _renamed(motion: MotionSet, source: Path, sources: Sequence[Path], prefix: bool, archive: bool) -> MotionSet:
+    """Return clips whose splits start with the folder that is their source, and whose names may have a prefix."""
+    unique = archive and sum(source.stem == other.stem for other in sources) == 1
+    start = f"{source.stem if unique else source.absolute().parent.name}-" * prefix
+    clips = [
+        replace(clip, name=start + clip.name, split=_split(clip.split, source, len(sources) > 1)) for clip in motion
+    ]
+    options: Any = {"skipped": motion.skipped, "interpretation": motion.interpretation, "missing": motion.missing}
+    return MotionSet(clips, motion.skeleton, motion.name, copy=False, **options)
 
 
 def _convert_file(

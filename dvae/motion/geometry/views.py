@@ -1,9 +1,9 @@
-"""Views of motion: windows with a fixed heading, bones of constant length, and rotations instead of positions."""
+"""Views of motion: fixed headings, bones of constant length, rotations instead of positions, and the root's travel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -14,13 +14,15 @@ from ...data.batch import WHOLE, Batch
 from ...data.views import View
 from ...networks.loop import valid_steps
 from . import kinematics
-from .rotations import in_time, size, to_matrix
+from .rotations import continuous, from_matrix, in_time, size, to_matrix
 from .skeleton import Skeleton, inverse_lengths, rotate_about_up
 
 HEADING = "heading"
 """Name in batches of the angles (B,) by which windows were rotated, in radians."""
 LENGTHS = "bone_lengths"
 """Name in batches of the bone lengths (B, J - 1) of windows, in metres, in the order of `Skeleton.edges`."""
+START = "travel_start"
+"""Name in batches of the root one frame before x, (B, 4): position with the height of frame 0, and heading."""
 ROTATIONS = "rotations"
 """Name in `Batch.view_inputs` of the rotations (B, T, 4 J) of all joints, as concatenated quaternions w x y z."""
 
@@ -355,3 +357,151 @@ class Rotations(View):
         rotations = rotations.index_copy(-3, indices(self.turning, rotations), known_rotations)
         positions, _ = kinematics.forward(skeleton.parents, rotations, offsets, root)
         return data | {WHOLE: (positions if self.root else skeleton.without_root(positions)).flatten(-2)}
+
+
+@dataclass(frozen=True)
+class Travel(View):
+    """The root's velocities, and poses relative to the root and its heading, instead of positions in the world.
+
+    Outside the model, x is positions (B, T, 3 J) in metres. The model sees the root's horizontal velocity relative to
+    the heading of the previous frame (metres per second), its height above the first frame (metres) and the rate of
+    the heading (radians per second). Then follow the other joints, relative to the root and rotated to heading zero.
+    Values do not depend on the position and heading of the window. The inverse adds up velocities from the last frame
+    of the past, or from the origin if no data are given.
+
+    The first frame has no predecessor and repeats the velocities of the second. Densities are densities of these
+    numbers, not of positions, because there is one number more than x has.
+
+    Args:
+        skeleton: skeleton of the poses; with a rest pose for rotations. Without left and right joints, the heading is
+            the direction between the first two siblings with subtrees of the same shape. Without these, it is 0 in
+            every frame, and velocities and poses keep the axes of the data.
+        form: "positions" of the other joints, or a form of `Rotations`.
+
+    Raises:
+        ValueError: the form is unknown, or it is a rotation and the skeleton has no rest pose.
+    """
+
+    skeleton: Skeleton
+    form: str = "positions"
+    names = (START, LENGTHS)
+    _pose: View = field(init=False, repr=False, compare=False)
+    _sides: Skeleton | None = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        pose, skeleton = View() if self.form == "positions" else Rotations(self.skeleton, self.form), self.skeleton
+        if not (skeleton.left and skeleton.right):
+            skeleton = replace(skeleton, left=(pair := _alike_siblings(skeleton))[:1], right=pair[1:])
+        object.__setattr__(self, "_pose", pose)
+        object.__setattr__(self, "_sides", skeleton if skeleton.left else None)
+
+    @property
+    def measured(self) -> str:  # type: ignore[override]
+        """Name of the values that densities refer to."""
+        return f"velocities of the root and {self._pose.measured or 'positions relative to it'}"
+
+    @property
+    def size(self) -> int:
+        """Number of values per frame that the model sees."""
+        return 4 + (self._pose.size if isinstance(self._pose, Rotations) else 3 * (self.skeleton.joints - 1))
+
+    @override
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
+        if WHOLE not in data or START in data:
+            return data
+        x, skeleton = data[WHOLE], self.skeleton
+        if x.shape[-1] != 3 * skeleton.joints:
+            raise ValueError(
+                f"x has shape {tuple(x.shape)}, but positions of the skeleton {skeleton.name!r} with its root have "
+                f"{3 * skeleton.joints} numbers in the last dimension"
+            )
+        if data.mask() is not None:
+            raise ValueError(
+                "a missing joint leaves the heading or the velocity of the root undetermined; fit under a protocol "
+                "with root='relative' and positions, which may be masked, or impute the joints first"
+            )
+        joints = x.unflatten(-1, (-1, 3))
+        root = joints[..., skeleton.root, :]
+        heading = x.new_zeros(x.shape[:-1]) if self._sides is None else self._sides.heading(joints)
+        if view_inputs is None:
+            rates = self._rates(root, heading)[:, :1] if x.shape[1] > 1 else x.new_zeros(len(x), 1, 4)
+            before = heading[:, :1] - rates[..., 3]
+            origin = root[:, :1] - rotate_about_up(rates[..., :3], before, skeleton.up)
+            start = torch.cat([origin, before[..., None]], -1)
+            start[..., skeleton.vertical] = root[:, :1, skeleton.vertical]
+        else:
+            start = self.following(view_inputs)[START][:, None]
+        rates = self._rates(torch.cat([start[..., :3], root], 1), torch.cat([start[..., 3], heading], 1))
+        rates = skeleton.fps * rates
+        rates[..., skeleton.vertical] = root[..., skeleton.vertical] - start[..., skeleton.vertical]
+        local = rotate_about_up(skeleton.without_root(joints - root[..., None, :]), -heading[..., None], skeleton.up)
+        pose = Batch({WHOLE: local.flatten(-2)})
+        if ROTATIONS in data.view_inputs:
+            pose["view_inputs"] = {ROTATIONS: self._facing(data.view_inputs[ROTATIONS][:, : x.shape[1]], heading)}
+        converted = Batch(self._pose(pose, view_inputs))
+        converted.pop("view_inputs", None)
+        converted[WHOLE] = torch.cat([rates, converted[WHOLE]], -1)
+        return data | converted | {START: start[:, 0]}
+
+    @override
+    def inverse(self, model_values: Batch) -> Batch:
+        data = Batch(model_values)
+        start, lengths = data.pop(START, None), data.pop(LENGTHS, None)
+        if WHOLE not in data:
+            return data
+        x, skeleton = data[WHOLE], self.skeleton
+        root, heading = self._path(x, start)
+        pose = Batch({WHOLE: x[..., 4:]} | ({} if lengths is None else {LENGTHS: lengths}))
+        local = skeleton.with_root(self._pose.inverse(pose)[WHOLE].unflatten(-1, (-1, 3)))
+        joints = rotate_about_up(local, heading[..., None], skeleton.up) + root[..., None, :]
+        return data | {WHOLE: joints.flatten(-2)}
+
+    @override
+    def following(self, data: Batch) -> Batch:
+        if START not in data:
+            return data
+        if WHOLE not in data:
+            raise ValueError("the view of the root's travel must see the frames before a forecast; remove `Past`")
+        root, heading = self._path(data[WHOLE], data[START])
+        end = torch.cat([root[:, -1], heading[:, -1:]], -1)
+        end[:, self.skeleton.vertical] = data[START][:, self.skeleton.vertical]
+        return data | {START: end}
+
+    def _rates(self, root: Tensor, heading: Tensor) -> Tensor:
+        """Return steps of the root (B, T - 1, 4): relative to the earlier heading, in metres, and turns in radians."""
+        turn = heading.diff(dim=1)
+        turn = torch.atan2(turn.sin(), turn.cos())
+        step = rotate_about_up(root.diff(dim=1), -heading[:, :-1], self.skeleton.up)
+        return torch.cat([step, turn[..., None]], -1)
+
+    def _path(self, x: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return root positions (..., T, 3) and headings (..., T) of values (..., T, D) that follow a start (B, 4)."""
+        start = x.new_zeros(4) if start is None else start.to(x)[..., None, :]
+        rates, vertical = x[..., :4] / self.skeleton.fps, self.skeleton.vertical
+        heading = start[..., 3] + rates[..., 3].cumsum(-1)
+        steps = rotate_about_up(rates[..., :3], heading - rates[..., 3], self.skeleton.up)
+        root = start[..., :3] + steps.cumsum(-2)
+        root[..., vertical] = start[..., vertical] + x[..., vertical]
+        return root, heading
+
+    def _facing(self, rotations: Tensor, heading: Tensor) -> Tensor:
+        """Return rotations (B, T, 4 J) of joints, with the root rotated to heading zero."""
+        quaternions, root = rotations.unflatten(-1, (-1, 4)).clone(), self.skeleton.root
+        axes = to_matrix(quaternions[:, :, root], "quaternion").mT
+        turned = rotate_about_up(axes, -heading[..., None].to(axes), self.skeleton.up).mT
+        quaternions[:, :, root] = continuous(from_matrix(turned, "quaternion"), dim=1)
+        facing: Tensor = quaternions.flatten(-2)
+        return facing
+
+
+def _alike_siblings(skeleton: Skeleton) -> tuple[int, ...]:
+    """Return the first joints, from the root on, that are the only two siblings with subtrees of one shape; or ()."""
+    children = {joint: [c for p, c in skeleton.edges if p == joint] for joint in range(skeleton.joints)}
+    shapes: dict[int, str] = {}
+    for joint in reversed(skeleton.order):
+        shapes[joint] = f"({''.join(sorted(shapes[child] for child in children[joint]))})"
+    for joint in skeleton.order:
+        for shape in dict.fromkeys(shapes[child] for child in children[joint]):
+            if len(pair := [child for child in children[joint] if shapes[child] == shape]) == 2:
+                return tuple(pair)
+    return ()

@@ -3,10 +3,10 @@
 Motion papers compare K futures with the true one in metres (`displacements`; definitions in
 `dvae.motion.scoring.metrics`). Their futures are means of the emission. Forecasts are therefore means by default
 (`Measure.of_means`), and the table says "mean emission"; `draw_emission=True` adds the noise of the emission. If
-windows include global motion (a protocol with root="relative"), these scores compare poses relative to their own root,
-as in TrajeVAE's evaluation. "global ADE" and "global FDE" compare all joints in world coordinates. If the paths of the
-same joints are given in all windows, "path error" is the mean distance of these joints from their paths, over all K
-futures.
+windows include global motion (a protocol whose root is not "drop"), these scores compare poses relative to their own
+root, as in TrajeVAE's evaluation. "global ADE" and "global FDE" compare all joints in world coordinates. If the paths
+of the same joints are given in all windows, "path error" is the mean distance of these joints from their paths, over
+all K futures.
 
 Two scores compare diversity and motion with their true amounts (BeLFusion: Barquero, Escalera and Palmero 2023,
 arXiv:2211.14304). *APDE* is |APD of the futures - APD of the multimodal ground truth|, averaged over the windows whose
@@ -109,7 +109,7 @@ def scores(
             f"scores of motion need windows of dvae.motion, which have a skeleton, not {type(windows).__name__}; for "
             "errors in metres only, use dvae.motion.displacements"
         )
-    moves = windows.protocol.root == "relative"
+    moves = windows.protocol.root != "drop"
     measures = displacements(windows, _body(windows.skeleton) if moves else lambda x: x, itself=itself)
     if moves:
         measures += [replace(measure, name=f"global {measure.name}", headline=False) for measure in (_ADE, _FDE)]
@@ -365,7 +365,7 @@ def _cumulative_motion(windows: Windows | ExchangedWindows, paces: Mapping[str, 
     if unknown := {*names} - {*(paces or names)}:
         raise ValueError(f"paces have no class {', '.join(sorted(unknown))}; give one for each action of the windows")
     classes = torch.tensor([names.index(label_of_window) for label_of_window in labels])
-    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+    body = _body(windows.skeleton) if windows.protocol.root != "drop" else lambda x: x
 
     def moved(x: Tensor) -> Tensor:
         """Return mean steps of the joints, (B, ..., T - 1), of frames (B, ..., T, D)."""
@@ -393,7 +393,7 @@ def _cumulative_motion(windows: Windows | ExchangedWindows, paces: Mapping[str, 
 
 def _jerk(windows: Windows | ExchangedWindows) -> Measure:
     """Return the jerk, including the transition from the observed frames."""
-    body = _body(windows.skeleton) if windows.protocol.root == "relative" else lambda x: x
+    body = _body(windows.skeleton) if windows.protocol.root != "drop" else lambda x: x
     start = max(windows.protocol.observed - SEAM, 0)
 
     def jerk(x: Tensor) -> Tensor:

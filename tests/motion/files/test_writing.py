@@ -177,12 +177,89 @@ def test_archives_of_clips_are_joined(walkers, tmp_path, capsys):
     assert f"dvae data convert {folder}/*.npz --out ALL.npz" in " ".join(capsys.readouterr().err.split())
     assert main(["data", "convert", *map(str, paths), "--out", out]) == 0
     assert read_motion(out).fingerprint() == walkers.fingerprint()
-    write_motion(tmp_path / "a.bvh", replace(walkers, clips=[walkers.clips[0]]))
     for other, message in (
-        (tmp_path / "a.bvh", "is an archive of clips and"),  # which was silently left out
         (paths[0], "occurs twice"),
         (folder / "z.npz", "its up axis is z, but y in"),
     ):
         save(folder / "z.npz", MotionSet([walkers.clips[0]], replace(WALKER, up="z")))
         assert main(["data", "convert", str(paths[0]), str(other), "--out", out]) == 1
         assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_files_with_their_own_units_are_merged(walkers, tmp_path, capsys):
+    first, second = (replace(walkers, clips=[clip]) for clip in walkers.clips[:2])
+    write_motion(tmp_path / "a.bvh", first)
+    save(tmp_path / "b.npz", second)
+    with np.load(tmp_path / "b.npz") as file:
+        inches = {name: file[name] / np.float32(0.0254) for name in file.files}
+    np.savez(tmp_path / "b.npz", **inches)
+    paths = [str(tmp_path / name) for name in ("a.bvh", "b.npz")]
+    command = ["data", "convert", *paths, "--out", str(tmp_path / "all.npz")]
+
+    def notes(*options, code=0):
+        assert main([*command, *options]) == code
+        return " ".join(capsys.readouterr().err.split())
+
+    assert "--units" in notes(code=1)  # inches are no plausible metres
+    wrong = notes("--units", f"{paths[1]}=0.015", code=1)
+    assert f"{paths[1]}: its body is" in wrong
+    assert f"as large as in {paths[0]}" in wrong
+    stated = notes("--units", f"{paths[1]}=in")
+    assert f"{paths[0]}: unit centimetres (0.01 m)" in stated
+    assert f"{paths[1]}: unit as given (0.0254 m)" in stated
+    merged = read_motion(tmp_path / "all.npz")
+    assert [clip.key for clip in merged] == [("all", "a"), second.clips[0].key]
+    np.testing.assert_allclose(merged.clips[0].positions, first.clips[0].positions, atol=1e-4)
+    np.testing.assert_allclose(merged.clips[1].positions, second.clips[0].positions, atol=1e-5)
+    assert "the length of a unit in metres, such as 0.01 for centimetres, got -1" in notes(
+        "--units", f"{paths[1]}=-1", code=1
+    )
+    write_motion(tmp_path / "c.npz", first, "amass")
+    assert main(["data", "convert", paths[0], str(tmp_path / "c.npz"), *command[4:]]) == 1
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"{paths[0]} seems to have the unit centimetres (0.01 m), {tmp_path / 'c.npz'} as the file says" in error
+    assert "--units FILE=0.01" in error
+    for option, message in (("c.npz=cm", "c.npz is not among the files"), (f"{paths[0]}=ell", "expected FILE=m")):
+        assert message in notes("--units", option, code=2)
+
+
+def test_clips_of_the_same_name_get_a_prefix(walkers, recordings, tmp_path, capsys):
+    (tmp_path / "b").mkdir()
+    for path in ("a.npz", "c.npz", "b/c.npz"):
+        save(tmp_path / path, walkers)
+    sources, out = [str(tmp_path / path) for path in ("a.npz", "c.npz", "b/c.npz")], str(tmp_path / "all.npz")
+    command = ["data", "convert", *sources, "--out", out]
+    assert main(command) == 1
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"occurs twice, in {sources[0]} and {sources[1]}" in error
+    assert "--prefix" in error
+    assert main([*command, "--prefix"]) == 0
+    names = {clip.name.removesuffix(f"-{walkers.clips[0].name}") for clip in read_motion(out)}
+    assert {"a", tmp_path.name, "b"} <= names
+    shutil.copytree(recordings, tmp_path / "d" / recordings.name)
+    folders = [str(recordings), str(tmp_path / "d" / recordings.name)]
+    assert main(["data", "convert", *folders, "--out", out]) == 1
+    assert "--prefix" in capsys.readouterr().err
+    assert main(["data", "convert", *folders, "--out", out, "--prefix"]) == 0
+    assert {clip.split for clip in read_motion(out)} == {f"{recordings.name}/train", f"{recordings.name}/test"}
+    assert any(clip.name.startswith("d-") for clip in read_motion(out))
+
+
+def test_files_with_other_rates_or_joints_are_merged_only_on_request(walkers, tmp_path, capsys):
+    first, second = (replace(walkers, clips=[clip]) for clip in walkers.clips[:2])
+    save(tmp_path / "a.npz", first)
+    save(tmp_path / "b.npz", second.resample(15))
+    paths = [str(tmp_path / name) for name in ("a.npz", "b.npz")]
+    command = ["data", "convert", *paths, "--out", str(tmp_path / "all.npz")]
+    assert main(command) == 1
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"{paths[1]}: 15 frames per second, {paths[0]} has 30" in error
+    assert main([*command, "--fps", "15"]) == 0
+    assert read_motion(tmp_path / "all.npz").skeleton.fps == 15
+    renamed = replace(WALKER, names=("Wing" if name == "LWrist" else name for name in WALKER.names))
+    save(tmp_path / "b.npz", MotionSet(second.clips, renamed))
+    capsys.readouterr()
+    assert main(command) == 1
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"{paths[1]}: does not have LWrist and has Wing, unlike {paths[0]}" in error
+    assert "--onto" in error
