@@ -6,9 +6,10 @@ The angle a is the noise level: 0 is the data, pi/2 is noise, and the log signal
 denoiser estimates v from z_a, the level and the features h (v-prediction; Salimans and Ho, 2022, arXiv 2202.00512).
 The probability-flow ODE is then dz / da = v(z, a; h). If the denoiser returns 0, the distribution is N(m, s^2).
 
-`Diffusion` has the bound of Kingma et al. (2021, arXiv 2107.00630), with levels from a to b and w = cot(a) da / dt:
+`Diffusion` has the bound of Kingma et al. (2021, arXiv 2107.00630). With the lowest level b, c = cos^2(b), and times t
+that are uniform from 0 to 1, it is
 
-    log p(u | h) >= -D/2 (log 2 pi + 1 - cos^2 a - log cos^2 a) - cos^2 a |u|^2 / 2 + E[w (2 v . v(z) - |v(z)|^2)]
+    log p(u | h) >= -D/2 (log 2 pi + 1 - c - log c) - c |u|^2 / 2 + E[w (2 v . v(z) - |v(z)|^2)],    w = cot(a) da / dt
 
 The paper's loss has w |v - v(z)|^2. Here the expectation of |v|^2 is in closed form, so that the estimate of the bound
 has no variance if the denoiser returns 0. `FlowMatching` has the regression loss of Lipman et al. (2022, arXiv
@@ -21,7 +22,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
@@ -41,12 +42,12 @@ EXACT_DIMENSION = 64
 """Largest number of coordinates for which `exact_log_prob` computes the trace exactly by default."""
 
 
-class DenoiserSpec(Protocol):
-    """Description of a denoiser of all steps, such as `networks.Denoiser`."""
+class DenoiserSpec:
+    """Base class of descriptions of a denoiser of all steps, such as `networks.Denoiser`."""
 
     def build(self, shape: Shape) -> nn.Module:
         """Return the module, whose arguments and result are those of `networks.denoising.SequenceDenoiser`."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -192,6 +193,8 @@ class DenoisingModule(ConditionalDistribution):
                 f"drop={spec.drop} hides the parents of {shape.name}, which has "
                 f"{'the parent that `residual` adds' if spec.residual else 'no parents'}; use drop=0"
             )
+        if spec.joint and not isinstance(spec.denoiser, DenoiserSpec):
+            raise TypeError(f"`denoiser` is {spec.denoiser}; expected a description such as networks.Denoiser(network)")
         if spec.joint and (shape.relation is None or spec.residual):
             raise ValueError(
                 f"a {type(spec).__name__} with a `denoiser` denoises all steps jointly, but {shape.name} "

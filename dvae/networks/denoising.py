@@ -11,16 +11,17 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from ..distributions.base import Shape
-from ..distributions.diffusion import LEVEL_SIZE, embed_level, small_linear
+from ..distributions.diffusion import LEVEL_SIZE, DenoiserSpec, embed_level, small_linear
 from ..factorization.relations import ALL
 from .attention import SelfAttention
 from .base import Input, NetworkSpec
 
 
 @dataclass(frozen=True)
-class Denoiser:
+class Denoiser(DenoiserSpec):
     """A denoiser of all steps of a variable.
 
     Args:
@@ -31,6 +32,7 @@ class Denoiser:
     network: NetworkSpec = field(default_factory=SelfAttention)
     cosine: bool = False
 
+    @override
     def build(self, shape: Shape) -> SequenceDenoiser:
         """Return the module for a variable of this shape.
 

@@ -386,6 +386,11 @@ def test_mistakes_are_refused(build, message):
         build()
 
 
+def test_a_network_is_not_a_denoiser():
+    with pytest.raises(TypeError, match="such as networks"):
+        joint("p(z) p(x_{1:T} | z)", "q(z | x_{1:T})", {"p(x)": Diffusion(denoiser=SelfAttention())})
+
+
 def test_one_diffusion_is_the_prior_of_a_latent_sequence():
     pair, spec = ("p(z_{1:T}) p(x_t | z_t)", "q(z_t | x_{1:T})"), Diffusion(denoiser=JOINT, steps=2)
     model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, distributions={"p(z)": spec})
