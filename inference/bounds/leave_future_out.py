@@ -29,7 +29,7 @@ from ...program.batch import AnyBatch, repeat
 from ...program.gaussian import is_linear_gaussian
 from ...program.model import DynamicalVAE
 from ...program.particles import effective_size, reads_ahead
-from .elbo import importance_weights, require_data, require_likelihood
+from .elbo import importance_weights, require_data, require_densities
 from .particles import fivo_bound, obstacle
 
 REPLICATES = 5
@@ -105,7 +105,7 @@ def leave_future_out(
         ValueError: when a sequence has fewer than L + M steps, the model has no likelihood or reads ahead, so that the
             density of a prefix depends on later steps, or groups of sequences share latents.
     """
-    require_likelihood(model)
+    require_densities(model)
     with model.running():
         data = model.read(batch)
         size, length, past = require_data(model, data), model.rollout(data).length, model.view.past
