@@ -6,6 +6,7 @@
 
 from .base import ConditionalDistribution, DistributionSpec, Shape
 from .conditional_flow import ConditionalFlow
+from .diffusion import Diffusion, FlowMatching
 from .families import Delta, Directions, FixedNormal, KnownNoise, Normal, StandardNormal, StudentT
 from .family import FAMILIES, Family, LowRankNormal, NormalMixture
 from .flow import FlowDistribution, QRFlow
@@ -19,12 +20,14 @@ __all__ = [
     "ConditionalDistribution",
     "ConditionalFlow",
     "Delta",
+    "Diffusion",
     "Directions",
     "DistributionSpec",
     "Family",
     "FixedNormal",
     "Flow",
     "FlowDistribution",
+    "FlowMatching",
     "KnownNoise",
     "LowRankNormal",
     "Mixture",

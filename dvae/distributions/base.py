@@ -12,13 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
 from torch.distributions import constraints, transform_to
 from torch.nn import functional
+
+from ..factorization.relations import Relation
 
 Parameters = tuple[Tensor, ...]
 
@@ -35,6 +37,8 @@ class Shape:
         data: names of the data variables of the model.
         guide: the `Conditional` q(w | ...) if the variable is a static latent w without parents, for priors that
             evaluate it, such as `Vamp`; otherwise None.
+        relation: steps of the variable that its value at step t may depend on, for a distribution of all steps jointly;
+            None for a distribution of single steps.
     """
 
     size: int
@@ -43,6 +47,7 @@ class Shape:
     name: str = "w"
     data: tuple[str, ...] = ()
     guide: Any = None
+    relation: Relation | None = None
 
 
 class ConditionalDistribution(nn.Module):
@@ -71,6 +76,8 @@ class ConditionalDistribution(nn.Module):
     """Whether draws are differentiable with respect to the parameters."""
     deterministic: ClassVar[bool] = False
     """Whether the variable is a function of its parents, so that it has no density."""
+    density: Literal["exact", "bound", "loss"] = "exact"
+    """What `log_prob` returns: the log density, a stochastic lower bound of it, or minus a loss without a density."""
     error_weight: bool = False
     """Whether the scale only weights a squared error and does not describe the spread of the data.
 

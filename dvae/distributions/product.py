@@ -73,7 +73,7 @@ class ProductModule(ConditionalDistribution):
         self.parts = nn.ModuleList(parts)
         self.places = [list(places) for places, _ in spec.parts]
         for index, part in enumerate(parts):
-            if part.deterministic:
+            if part.deterministic or part.density == "loss":
                 raise ValueError(
                     f"the distribution {spec.parts[index][1]} of the coordinates {self.places[index]} of {shape.name} "
                     "has no density, which a Product requires; use a distribution with a density, such as Normal()"
@@ -87,6 +87,7 @@ class ProductModule(ConditionalDistribution):
             self.counts = [len(self._part(n, probe, before, None)) for n in range(len(parts))]
         self.discrete = any(part.discrete for part in parts)
         self.reparameterised = all(part.reparameterised for part in parts)
+        self.density = "bound" if any(part.density == "bound" for part in parts) else "exact"
         supports = [part.support for part in parts]
         if None in supports:
             self.support = None

@@ -9,6 +9,7 @@ autoencoders: a comprehensive review* (arXiv 2008.12595).
 
     factorization := factor+            factor := ("p"|"q") "(" variable [ "|" parent ("," parent)* ] ")"
     variable := name | name "_t"        one per sequence (static) | one per time step (local)
+                | name "_{1:T}"         all steps: p(x_{1:T} | w) is read as its chain rule, p(x_t | x_{<t}, w)
     parent   := name | name "_" relation
     relation := t | {t-k} | {t+k} | {<t} | {<=t} | {>t} | {>=t} | {a:b} | {1:T} | {a name given in masks}
                 where a is 1, t, t-k or t+k and b is T, t, t-k or t+k
@@ -674,19 +675,22 @@ class _Reader:
         kind: Literal["p", "q"] = "p" if head[1] == "p" else "q"
         start = self.position
         child = self.variable()
-        if child.relation not in (None, NOW):
+        if child.relation not in (None, NOW, ALL):
             self.fail(f"a factor is for one step: write {kind}({child.name}_t | ...), not {child}", start)
-        parents: dict[str, Parent] = {}
+        is_whole = child.relation == ALL
+        parents = {child.name: Parent(child.name, True, PAST)} if is_whole else {}
         if self.take(r"\||\\mid(?![a-z])|\\vert(?![a-z])"):
             while True:
                 self.take("")
                 start = self.position
                 parent = self.variable()
                 is_relative = parent.relation not in (None, ALL) and parent.relation.intervals is not None
-                if is_relative and not child.local:
+                if is_relative and (is_whole or not child.local):
                     self.fail(
-                        f"{child.name} has one value per sequence and no step t to which {parent} could refer; "
-                        f"write {parent.name}_{{1:T}}",
+                        f"{child if is_whole else f'{child.name} has one value per sequence and'} has no step t to "
+                        f"which {parent} could refer; write {parent.name}_{{1:T}}"
+                        + f", or the chain rule {kind}({child.name}_t | {child.name}_{{<t}}, {parent})"
+                        * is_whole,
                         start,
                     )
                 if (previous := parents.get(parent.name)) and previous.relation and parent.relation:

@@ -7,6 +7,7 @@
 from .attention import Attention, SelfAttention
 from .base import Input, Network, NetworkSpec
 from .cosine import CosineDecoder, CosineEncoder
+from .denoising import Denoiser
 from .graphconv import GraphConv
 from .graphs import FrameGraph, NodeGraph
 from .known_noise import WithNoise
@@ -19,6 +20,7 @@ __all__ = [
     "Attention",
     "CosineDecoder",
     "CosineEncoder",
+    "Denoiser",
     "Dense",
     "FrameGraph",
     "GraphConv",

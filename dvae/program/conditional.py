@@ -21,6 +21,7 @@ from ..distributions.chain import DERIVATIVES, gaussian_chain
 from ..distributions.families import NormalModule
 from ..distributions.precise import OffsetDistribution
 from ..factorization.notation import Factor
+from ..factorization.relations import ALL, NOW, PAST, Relation
 from ..networks.base import Input, Network, NetworkSpec, indicator, presence
 from ..networks.loop import Rows, at, extend_features, memoize, memoize_valid, select, shift, stack_steps, valid_steps
 from .groups import Groups
@@ -59,6 +60,25 @@ def like(module: nn.Module) -> Tensor:
     return next(module.buffers())
 
 
+def joint_relation(factor: Factor) -> Relation:
+    """Return the steps of the child that its value at t may depend on, if a factor draws all steps jointly.
+
+    These are all steps s whose parents are parents at t too, so that the masks of the parents hold.
+
+    Raises:
+        ValueError: the factor is not p(x_{1:T} | ...), or it reads a parent at other steps than {1:T}, {<=t} or {<t}.
+    """
+    own, up_to_now = factor.parent(factor.child), PAST | NOW
+    relations = {p.relation for p in factor.parents if p.local and p.name != factor.child}
+    if own is None or own.relation != PAST or relations - {ALL, PAST, up_to_now}:
+        raise ValueError(
+            f"a distribution of all steps needs a factor such as {factor.kind}({factor.child}_{{1:T}} | h_{{1:T}}), or "
+            f"{factor.kind}({factor.child}_t | {factor.child}_{{<t}}, h_{{<=t}}), with parents that are static or read "
+            f"at {{1:T}}, {{<=t}} or {{<t}}; got {factor}"
+        )
+    return ALL if relations <= {ALL} else up_to_now
+
+
 class Conditional(nn.Module):
     """A conditional distribution p(child | parents) or q(child | parents).
 
@@ -79,6 +99,7 @@ class Conditional(nn.Module):
     Attributes:
         discrete, reparameterised: as the distribution declares (`ConditionalDistribution`).
         whole: whether all coordinates form one event (`ConditionalDistribution.event_dim`).
+        joint: whether all steps are drawn jointly instead of from their own past, which is then not a parent.
     """
 
     interior_point: Tensor | None
@@ -97,11 +118,13 @@ class Conditional(nn.Module):
         super().__init__()
         self.factor = factor
         self.size = sizes[factor.child]
-        self.sizes = {parent.name: sizes[parent.name] for parent in factor.parents}
+        self.joint = getattr(distribution, "joint", False)
+        read = [parent for parent in factor.parents if not (self.joint and parent.name == factor.child)]
+        self.sizes = {parent.name: sizes[parent.name] for parent in read}
         self.indicators = [name for name in self.sizes if name in indicators]
         self.network: Network | None = None
         wide = {name: size * (1 + (name in self.indicators)) for name, size in self.sizes.items()}
-        inputs = [Input(p.name, wide[p.name], p.relation if p.local else None) for p in factor.parents]
+        inputs = [Input(p.name, wide[p.name], p.relation if p.local else None) for p in read]
         if inputs or not generative:
             self.network = network.build(inputs or [Input(CONSTANT, 1)], factor.local, self.size)
             if self.network.head and not isinstance(distribution, self.network.head):
@@ -111,8 +134,9 @@ class Conditional(nn.Module):
                     f"{distribution}; give the factor {expected}()"
                 )
         features = 0 if self.network is None else self.network.features
-        self.head = distribution.build(Shape(self.size, features, factor.local, factor.child, data, guide))
-        self.parents = [parent.name for parent in factor.parents]
+        relation = joint_relation(factor) if self.joint else None
+        self.head = distribution.build(Shape(self.size, features, factor.local, factor.child, data, guide, relation))
+        self.parents = [parent.name for parent in read]
         self.units: dict[str, Units] = {}  # the model registers them
         self.exposure: tuple[str, Sequence[int]] | None = None
         self.discrete = self.head.discrete
@@ -200,6 +224,25 @@ class Conditional(nn.Module):
             lengths: (B,) valid steps of a ragged batch.
             groups: groups of sequences that share the child; features are averaged over each group.
         """
+        if self.joint:
+            observed = self._observed_steps(parents.get(indicator(self.factor.child)), batch, length, lengths)
+            return *self._forward(parents, batch, length, lengths, groups), observed
+        return self._forward(parents, batch, length, lengths, groups)
+
+    def _observed_steps(self, mask: Tensor | None, batch: int, length: int, lengths: Tensor | None) -> Tensor:
+        """Return 1 at observed steps, 0 at missing steps and -1 at padding, (B, T, 1)."""
+        ones = like(self).new_ones(batch, length, 1)
+        observed = ones if mask is None else mask.all(-1, keepdim=True).to(ones)
+        return observed if lengths is None else observed.where(valid_steps(lengths, length)[..., None], -ones)
+
+    def _forward(
+        self,
+        parents: Mapping[str, Tensor],
+        batch: int,
+        length: int,
+        lengths: Tensor | None,
+        groups: Groups | None,
+    ) -> Parameters:
         if self.network is None:
             shape = (batch, length, 0) if self.factor.local else (batch, 0)
             return self._rescale(self.head(like(self.head).new_empty(shape)))
@@ -306,6 +349,11 @@ class Conditional(nn.Module):
             length: T.
             lengths: (B,) valid steps of a ragged batch.
         """
+        if self.joint:
+            raise ValueError(
+                f"{self.factor} draws all steps of {self.factor.child} jointly, but here they are drawn step by step; "
+                "use a distribution of single steps, such as Diffusion(denoiser=None)"
+            )
         if self.network is None:
             return tuple(p.unbind(1) for p in self(parents, batch, length))
         state = self.network.start(self._read(parents, batch, lengths), batch, length, lengths)

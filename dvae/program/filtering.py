@@ -510,6 +510,8 @@ def _obstacle(model: Any, run: Rollout, proposal: Mapping[str, str]) -> str:
     """Return the reason why a model cannot be filtered; "" if it can."""
     if not model.likelihood:
         return f"{model.generative} has no likelihood, so data do not weight its latents"
+    if model.bounded:
+        return f"{', '.join(model.bounded)} has a bound in place of a density, which does not weight draws"
     if run.groups is not None:
         return f"groups share {', '.join(model.grouped)}, but a filter has one sequence at a time; leave out 'group'"
     unknown = {*model.observed, *model.latents, *model.summed}

@@ -185,11 +185,17 @@ def impute(
     masks = values.masks(WHOLE if model.view.parts else model.observed[0])
     if not masks:
         raise ValueError("this batch has no missing entries; give a 'mask' that is False at the entries to fill")
+    if joint := [name for name in model.observed if model.generator[name].joint]:
+        raise ValueError(
+            f"all steps of {', '.join(joint)} are drawn jointly, and not given the observed ones, so they cannot be "
+            "imputed; use a distribution of single steps"
+        )
     drawing = model.is_drawn() if draw is None else draw
-    if particles < 1 or (particles > 1 and not (drawing and model.likelihood)):
+    exact = model.likelihood and not model.bounded
+    if particles < 1 or (particles > 1 and not (drawing and exact)):
         raise ValueError(
             f"particles must be at least 1, and more than 1 require draws (draw=True) and a likelihood, which "
-            f"{model.generative} {'has' if model.likelihood else 'does not have'}; got {particles} and draw={drawing}"
+            f"{model.generative} {'has' if exact else 'does not have'}; got {particles} and draw={drawing}"
         )
     draws = (
         _impute_draws(model, batch, samples, chunk, particles)

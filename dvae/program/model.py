@@ -218,7 +218,14 @@ class DynamicalVAE(nn.Module):
 
     def _check_latents(self) -> None:
         for name in self.latents:
-            for conditional in (self.generator[name], self.encoder[name]):
+            # minus a lower bound of the guide's density is an upper bound, so the ELBO would not be a bound
+            for conditional, allowed in ((self.generator[name], ("exact", "bound")), (self.encoder[name], ("exact",))):
+                if conditional.head.density not in allowed:
+                    raise ValueError(
+                        f"{conditional.factor} has a {conditional.head.density} in place of a density, but the "
+                        f"distribution of a latent needs a density{' or a bound' * ('bound' in allowed)}; use another "
+                        "one, such as distributions.Normal()"
+                    )
                 if conditional.discrete or (conditional is self.encoder[name] and not conditional.reparameterised):
                     problem = "are discrete" if conditional.discrete else "are not reparameterised"
                     raise ValueError(
@@ -290,9 +297,18 @@ class DynamicalVAE(nn.Module):
     def likelihood(self) -> bool:
         """Whether the data have a density given the latents.
 
-        Models without one (`distributions.Delta`) have no bound.
+        Models without one (`distributions.Delta`, `distributions.FlowMatching`) have no bound.
         """
-        return not any(self.generator[name].head.deterministic for name in self.observed)
+        heads = [self.generator[name].head for name in self.observed]
+        return not any(head.deterministic or head.density == "loss" for head in heads)
+
+    @property
+    def bounded(self) -> tuple[str, ...]:
+        """Names of the variables with a stochastic lower bound in place of a density (`distributions.Diffusion`).
+
+        Bounds on the evidence remain bounds. Importance weights are not available.
+        """
+        return tuple(name for name, each in self.generator.items() if each.head.density == "bound")
 
     @property
     def has_curriculum(self) -> bool:
@@ -686,8 +702,10 @@ class DynamicalVAE(nn.Module):
             latents: value of every latent by name, (B, T, D), or (B, D) for a static latent.
 
         Raises:
-            ValueError: if a latent is missing or has the wrong shape.
+            ValueError: if a latent is missing or has the wrong shape, or a variable has a loss instead of a density.
         """
+        if losses := [name for name in self.observed if self.generator[name].head.density == "loss"]:
+            raise ValueError(f"{', '.join(losses)} has a loss instead of a density, so the model has no log joint")
         if missing := [name for name in self.latents if name not in latents]:
             raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
         for name, value in latents.items():

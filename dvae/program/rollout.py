@@ -500,6 +500,11 @@ class Rollout:
         draws = {}
         for name in live:
             conditional = self.conditionals[name]
+            if conditional.joint and name in self.prefix:
+                raise ValueError(
+                    f"{conditional.factor} draws all steps of {name} jointly, and not given some of them; make the "
+                    "past context (dvae.data.views.Past), or use a distribution of single steps"
+                )
             parameters = conditional(inputs, self.batch, self.length, self.lengths)
             drawing = name in noise
             value = conditional.draw(parameters, noise[name]) if drawing else conditional.mean(parameters)

@@ -33,7 +33,7 @@ from ...program.model import DynamicalVAE
 from ..diagnostics.latents import joined, split
 from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.result import progress_bar
-from .elbo import joint_and_guide, require_data, require_latents, require_likelihood
+from .elbo import joint_and_guide, require_data, require_densities, require_latents
 
 ACCEPTED = 0.8
 """Target acceptance rate of Hamiltonian proposals."""
@@ -119,7 +119,7 @@ def annealed_bound(
             f"temperatures, chains, leaps and chunk must be at least 1, got {temperatures}, {chains}, {leaps} and "
             f"{chunk}"
         )
-    require_likelihood(model)
+    require_densities(model)
     data = model.read(batch)
     require_latents(model)
     if model.grouped and data.group is not None:

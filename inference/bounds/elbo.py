@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -47,6 +47,9 @@ class Terms:
         energies: energy (B,) of each penalty (a `pyro.factor` site), positive if it costs.
         n_steps: number of valid steps, (B,).
         steps: log-likelihood or KL by step (B, T) of each local variable, 0 at padding.
+        bounded: names of the variables whose term has a stochastic bound in place of a log density
+            (`distributions.Diffusion`). `bound` remains a lower bound. The terms of single steps of a variable that is
+            drawn jointly are shares, not conditional densities.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -60,12 +63,13 @@ class Terms:
     energies: dict[str, Tensor]
     n_steps: Tensor
     steps: dict[str, Tensor] = field(default_factory=dict)
+    bounded: tuple[str, ...] = ()
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Terms:
         """Return the terms with `change` applied to every tensor."""
         tables = (self.log_likelihood, self.kl, self.energies, self.steps)
         likelihood, kl, energies, steps = ({name: change(value) for name, value in t.items()} for t in tables)
-        return Terms(likelihood, kl, energies, change(self.n_steps), steps)
+        return Terms(likelihood, kl, energies, change(self.n_steps), steps, self.bounded)
 
     @property
     def likelihood(self) -> bool:
@@ -188,8 +192,13 @@ class SequenceELBO(ELBO):
                 _record(terms, terms.kl, name, _kl(fn, guide_sites[name]["fn"], value, name in closed), run)
             elif site["infer"].get("_deterministic"):
                 continue
+            elif site["is_observed"] and _density(run, name) == "loss":
+                _record(terms, terms.energies, name, -site_log_prob(fn, value), run)
+                terms.steps.pop(name, None)
             elif site["is_observed"]:
                 _record(terms, terms.log_likelihood, name, site_log_prob(fn, value), run)
+                if run is not None:  # the run of the model; a replayed latent has the run of the guide
+                    terms.bounded = tuple(n for n in run.conditionals if _density(run, n) == "bound")
             else:
                 raise ValueError(
                     f"the latent {name} is in the model but not in the guide; add a sample site {name} to the guide"
@@ -198,6 +207,10 @@ class SequenceELBO(ELBO):
         if values and not len(terms.n_steps):  # no variable has steps, so each sequence counts once
             terms.n_steps = torch.ones_like(values[0])
         return terms
+
+
+def _density(run: Rollout | None, name: str) -> str:
+    return "exact" if run is None else run.conditionals[name].head.density
 
 
 def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
@@ -314,7 +327,7 @@ def _mean(draws: list[Terms]) -> Terms:
 
     tables = zip(*((d.log_likelihood, d.kl, d.energies, d.steps) for d in draws), strict=True)
     likelihood, kl, energies, steps = map(average, tables)
-    return Terms(likelihood, kl, energies, draws[0].n_steps, steps)
+    return Terms(likelihood, kl, energies, draws[0].n_steps, steps, draws[0].bounded)
 
 
 def require_likelihood(model: DynamicalVAE) -> None:
@@ -328,6 +341,28 @@ def require_likelihood(model: DynamicalVAE) -> None:
             f"{model.generative} has no likelihood: its data are functions of its latents, trained by energies. It "
             "has no bound, and nothing to calibrate; evaluate its forecasts with dvae.evaluate"
         )
+
+
+def require_densities(model: DynamicalVAE) -> None:
+    """Refuse a model without a likelihood, or with a bound in place of a density.
+
+    The mean of importance weights with a stochastic bound may exceed the evidence.
+
+    Raises:
+        ValueError: when the model has no likelihood, or not every variable has an exact density.
+    """
+    require_likelihood(model)
+    if model.bounded:
+        raise ValueError(
+            f"{', '.join(model.bounded)} of {model.generative} has a stochastic lower bound in place of a density, so "
+            "importance weights are not available; use SequenceELBO or particles=1, whose bound remains a lower bound"
+        )
+
+
+def bound_notes(label: str, model: DynamicalVAE) -> Iterator[str]:
+    """Yield a note for tables if a variable of the model has a stochastic bound in place of a density."""
+    if model.bounded:
+        yield f"bounds of {label}: {', '.join(model.bounded)} has a stochastic lower bound in place of a log density"
 
 
 def require_latents(model: DynamicalVAE) -> None:
@@ -395,7 +430,8 @@ def iwae_bound(
         Bound and tail shape, (B,) each.
 
     Raises:
-        ValueError: `particles` is less than 1, or the model has no likelihood.
+        ValueError: `particles` is less than 1, the model has no likelihood, or `particles` is above 1 and a variable
+            has a stochastic bound in place of a density.
 
     Example:
         >>> model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
@@ -404,7 +440,7 @@ def iwae_bound(
     """
     if particles < 1:
         raise ValueError(f"particles must be at least 1, got {particles}")
-    require_likelihood(model)
+    (require_densities if model.latents and particles > 1 else require_likelihood)(model)
     with model.running():
         data = model.read(batch)
         size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))

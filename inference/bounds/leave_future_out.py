@@ -7,18 +7,17 @@ for every t. Here the weights were fitted to other sequences and do not change, 
 log evidences, log p(x_{1:t+M}) - log p(x_{1:t}). The latents are integrated out. The sum telescopes: only the evidences
 of the M first and the M last prefixes remain.
 
-The evidence of a prefix is exact for a linear-Gaussian model without context whose networks are `networks.Linear`, as
-for `Oracle`, and for a model whose latents are all summed out.
-Otherwise, R independent estimates of it are averaged, each by K particles (`fivo_bound`) or, for a guide that
-particles cannot follow, by K importance weights. The guide reads the prefix alone, so no proposal depends on the
-future. The Monte Carlo standard error is the jackknife's over the R estimates.
+The evidence of a prefix is exact where `DynamicalVAE.filter` is: for a linear-Gaussian model, whose networks are
+`networks.Linear` or `networks.Dense(())`, and for a model whose latents are all summed out. Otherwise, R independent
+estimates of it are averaged, each by K particles (`fivo_bound`) or, for a guide that particles cannot follow, by K
+importance weights. The guide reads the prefix alone, so no proposal depends on the future. The Monte Carlo standard
+error is the jackknife's over the R estimates.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import torch
@@ -27,10 +26,10 @@ from torch import Tensor
 from ...data.batch import Batch
 from ...networks.loop import valid_steps
 from ...program.batch import AnyBatch, repeat
+from ...program.gaussian import is_linear_gaussian
 from ...program.model import DynamicalVAE
-from ...program.oracle import Oracle
 from ...program.particles import effective_size, reads_ahead
-from .elbo import importance_weights, require_data, require_likelihood
+from .elbo import importance_weights, require_data, require_densities
 from .particles import fivo_bound, obstacle
 
 REPLICATES = 5
@@ -106,7 +105,7 @@ def leave_future_out(
         ValueError: when a sequence has fewer than L + M steps, the model has no likelihood or reads ahead, so that the
             density of a prefix depends on later steps, or groups of sequences share latents.
     """
-    require_likelihood(model)
+    require_densities(model)
     with model.running():
         data = model.read(batch)
         size, length, past = require_data(model, data), model.rollout(data).length, model.view.past
@@ -163,9 +162,8 @@ def _evidences(model: DynamicalVAE, data: Batch, particles: int, chunk: int) -> 
     size, exact = require_data(model, data), None
     if not model.latents:
         exact = importance_weights(model, data, size, 1, chunk)[0]
-    else:
-        with suppress(ValueError):  # not linear-Gaussian, or with context
-            exact = Oracle(model, model.rollout(data).length).evidence(data)
+    elif is_linear_gaussian(model):
+        exact = model.filter(data).filtered.log_evidence.sum(1)
     if exact is not None:
         return exact[None], torch.full_like(exact, math.inf)
     if obstacle(model, data):

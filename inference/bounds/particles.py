@@ -19,7 +19,7 @@ from torch import Tensor
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
 from ...program.particles import Particles, hidden_data, late_statics, reads_ahead
-from .elbo import require_data, require_likelihood
+from .elbo import require_data, require_densities
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def fivo_bound(
         raise ValueError(f"particles must be a whole number, at least 1, got {particles!r}")
     if not 0 <= resample_below <= 1:
         raise ValueError(f"resample_below must be a share of the particles, between 0 and 1, got {resample_below}")
-    require_likelihood(model)
+    require_densities(model)
     with model.running():
         data = model.read(batch)
         size = require_data(model, data)
@@ -99,6 +99,8 @@ def obstacle(model: DynamicalVAE, batch: AnyBatch) -> str:
     """
     run = model.rollout(batch)
     instead = "use iwae_bound"
+    if model.bounded:
+        return f"{', '.join(model.bounded)} has a stochastic lower bound in place of a density"
     if model.summed:
         return f"{', '.join(model.summed)} is summed out exactly, not by particles; {instead}"
     if run.groups is not None:

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
-from .elbo import IWAEBound, importance_mean, log_densities, require_likelihood, sites_of, total
+from .elbo import IWAEBound, importance_mean, log_densities, require_densities, sites_of, total
 
 
 @torch.no_grad()
@@ -51,7 +51,7 @@ def predictive_bound(
         ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no step is
             left to observe or to predict.
     """
-    require_likelihood(model)
+    require_densities(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
         raise ValueError(
             f"{type(model).__name__} has a custom forecast, whose density is not known; omit the log score"

@@ -37,7 +37,7 @@ from ...program.batch import AnyBatch, repeat
 from ...program.conditional import Conditional
 from ...program.model import DynamicalVAE
 from ..evaluation.evaluation_windows import seeded_evaluation
-from .elbo import joint_and_guide, require_data, require_latents, require_likelihood, sites_of
+from .elbo import joint_and_guide, require_data, require_densities, require_latents, sites_of
 
 UNITS = 32
 """Number of draws from the guide for the units."""
@@ -296,7 +296,7 @@ def require_local(model: DynamicalVAE) -> None:
     Raises:
         ValueError: when the model has no latents or no likelihood, or a latent is not normal in the guide.
     """
-    require_likelihood(model)
+    require_densities(model)
     require_latents(model)
     for name in model.latents:
         if not isinstance(model.encoder[name].head, Gaussian):

@@ -35,7 +35,7 @@ from ...data.sequences import HeldOutWindows, Listed, axis_names, cluster_keys, 
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
 from ..bounds.annealing import annealed_bound
-from ..bounds.elbo import joint_and_guide, require_latents, require_likelihood
+from ..bounds.elbo import joint_and_guide, require_densities, require_latents
 from ..bounds.particles import fivo_bound, obstacle
 from ..bounds.semi_amortized import missing_latents, require_local, semi_amortized_guide
 from ..bounds.teacher_forced import length_of
@@ -310,7 +310,7 @@ def bracket(
             "count, particles, temperatures, chains and batch_size must be at least 1, fitting at least 0, got "
             f"{count}, {particles}, {temperatures}, {chains}, {batch_size} and {fitting}"
         )
-    require_likelihood(model)
+    require_densities(model)
     require_latents(model)
     data = take_split(data, "test")
     all_rows, notes = sequences(data).batch, []

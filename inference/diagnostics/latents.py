@@ -14,7 +14,7 @@ from ...data.batch import Batch
 from ...networks.loop import valid_steps
 from ...program.batch import AnyBatch, repeat, rows
 from ...program.model import DynamicalVAE
-from ..bounds.elbo import log_densities, require_data, require_latents, require_likelihood, total
+from ..bounds.elbo import log_densities, require_data, require_densities, require_latents, total
 
 Values = Mapping[str, Tensor]
 Shapes = Mapping[str, tuple[int, int]]
@@ -65,7 +65,7 @@ def some_of(model: DynamicalVAE, batch: AnyBatch, sequences: Sequence[int] | Non
         ValueError: when the model has no likelihood or latents, or a latent is shared by sequences or cannot take every
             real value. Also when data are missing, or a sequence is not in the batch.
     """
-    require_likelihood(model)
+    require_densities(model)
     require_latents(model)
     require_real(model)
     data = model.read(batch)

@@ -27,7 +27,7 @@ from ...options import Count, Positive, Range, require
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
 from ...program.oracle import Oracle
-from ..bounds.elbo import log_densities, require_data, require_likelihood, total
+from ..bounds.elbo import log_densities, require_data, require_densities, total
 from ..evaluation.ensemble import Ensemble
 from ..evaluation.evaluation_windows import seeded_evaluation
 from ..evaluation.result import progress_bar
@@ -131,7 +131,7 @@ def weight_posterior(
     require(Annotated[int, Range(2, 64)], chains=chains)
     require(Positive, scale=scale)
     require(Literal["nuts", "laplace"], method=method)
-    require_likelihood(model)
+    require_densities(model)
     copy = deepcopy(model).double()
     with seeded_evaluation(copy, seed), copy.running(), torch.enable_grad(), progress_bar(progress) as bar:
         data = copy.read(batch)

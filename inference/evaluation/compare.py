@@ -20,7 +20,7 @@ from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, Listed, axis_names, cluster_keys, sequences, take_split
 from ...options import Count, require
 from ...program.model import DynamicalVAE
-from ..bounds.elbo import require_likelihood
+from ..bounds.elbo import bound_notes, require_densities, require_likelihood
 from ..bounds.leave_future_out import LeaveFutureOut, mixture
 from ..bounds.leave_future_out import leave_future_out as left_out_densities
 from ..bounds.particles import obstacle
@@ -236,7 +236,7 @@ def _score_model(
                     refuse_non_finite(label, "leave-future-out density", future[-1].elpd.isfinite(), keys[part])
         with seeded_evaluation(model, seed):
             scores = bounds(label, model, batch, keys, particles, estimates, parts("bounds", len(keys), batch_size))
-        scores |= {"left out": future, "notes": []}
+        scores |= {"left out": future, "notes": list(bound_notes(label, model))}
         if filter_particles and (reason := obstacle(model, model.read(on_device_of(model, batch)))):
             scores["notes"].append(f"no FIVO bound: {reason}")
         elif filter_particles:
@@ -313,7 +313,7 @@ def _contenders(models: Mapping[str, Any]) -> dict[str, list[DynamicalVAE]]:
     for name, versions in contenders.items():
         require_same(repr(name), versions)
         for version in versions:
-            require_likelihood(version)
+            (require_densities if isinstance(models[name], Ensemble) else require_likelihood)(version)
     return contenders
 
 

@@ -28,7 +28,7 @@ from ...data.sequences import HeldOutWindows, axis_names
 from ...options import Count, Delay, require
 from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting, Forecasting
-from ..bounds.elbo import SequenceELBO, iwae_bound
+from ..bounds.elbo import SequenceELBO, bound_notes, iwae_bound
 from ..bounds.predictive import predictive_bound
 from .baselines import Forecaster
 from .evaluation import Evaluation, Row
@@ -192,6 +192,7 @@ def evaluate(
                 for name, each in models.items()
                 if isinstance(each, DynamicalVAE) and each.likelihood and each.view.measured
             ),
+            *(n for name, each in models.items() if isinstance(each, DynamicalVAE) for n in bound_notes(name, each)),
         ],
         options=dict(options or {}),
     )

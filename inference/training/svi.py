@@ -337,7 +337,8 @@ class SVI:
         for name, parameter in self.model.named_parameters():
             parameter.grad = parts["gradient"].get(name)
         tables = {table: parts.get(table, {}) for table in _TABLES}
-        terms = Terms(**tables, n_steps=results["n_steps"]).map(torch.clone)
+        bounded = getattr(self.model, "bounded", ())
+        terms = Terms(**tables, n_steps=results["n_steps"], bounded=bounded).map(torch.clone)
         self._verdict(verdict, terms)
         self._adapt(parts.get("measured", {}))
         return terms

@@ -128,7 +128,8 @@ def test_any_text_is_parsed_or_a_value_error(text):
         ("p(z_t | x_{<t", 10, '"{" without "}"'),
         ("p(z_t | z_{t-1}", 15, 'expected "," or ")"'),
         ("p(z_t |)", 7, "expected a variable"),
-        ("p(z_{1:T} | w)", 2, "a factor is for one step: write p(z_t | ...), not z_{1:T}"),
+        ("p(z_{<=t} | w)", 2, "a factor is for one step: write p(z_t | ...), not z_{<=t}"),
+        ("p(z_{1:T} | x_t)", 12, "z_{1:T} has no step t to which x_t could refer; write x_{1:T}"),
         ("p(z_t) q(x_t)", 7, "p and q in one factorization"),
     ],
 )
@@ -139,6 +140,11 @@ def test_syntax_errors_point_at_their_column(text, column, expected):
     assert message.startswith(expected)
     assert line == "    " + text
     assert caret == "    " + " " * column + "^"
+
+
+def test_a_factor_of_all_steps_is_its_chain_rule():
+    assert parse("p(x_{1:T} | y_{1:T}, w)") == parse("p(x_t | x_{<t}, y_{1:T}, w)")
+    assert parse("p(w) p(x_{1:T} | w)").text == "p(w) p(x_t | x_{<t}, w)"
 
 
 # ------------------------------------------------------------------------------------------------------ masks

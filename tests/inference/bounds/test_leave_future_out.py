@@ -9,9 +9,10 @@ import torch
 
 from dvae import Discrete, DynamicalVAE, Oracle, iwae_bound, linear_gaussian_surrogate
 from dvae.data.views import View
+from dvae.distributions import FixedNormal
 from dvae.inference.bounds import leave_future_out as module
 from dvae.inference.bounds.leave_future_out import REPLICATES, leave_future_out, mixture
-from dvae.networks import Linear, Recurrent
+from dvae.networks import Dense, Linear, Recurrent
 
 T = 6
 P = "p(z_t | z_{t-1}) p(x_t | z_t)"
@@ -50,11 +51,8 @@ def brute_force(model, batch, observed, horizon):
     ).detach()
 
 
-def without_oracle(monkeypatch):
-    def refuse(*_):
-        raise ValueError
-
-    monkeypatch.setattr(module, "Oracle", refuse)
+def without_exact_filter(monkeypatch):
+    monkeypatch.setattr(module, "is_linear_gaussian", lambda _: False)
 
 
 @pytest.mark.parametrize(("observed", "horizon"), [(1, 1), (2, 2), (2, 4), (1, 4), (5, 1)])
@@ -74,6 +72,19 @@ def test_linear_gaussian_densities_are_exact(kind, observed, horizon):
     assert out.n_steps.tolist() == (horizon * origins).tolist()
 
 
+def test_dense_networks_without_layers_and_with_context_are_linear():
+    pair = "p(z_t | z_{t-1}) p(x_t | z_t, u_t)", "q(z_t | z_{t-1}, x_t)"
+    torch.manual_seed(0)
+    model = DynamicalVAE(
+        *pair, {"z": 2, "x": 1, "u": 1}, Dense(()), {"p(z)": FixedNormal(), "p(x)": FixedNormal()}
+    ).double()
+    x, u = torch.randn(3, T, 1).double(), torch.randn(3, T, 1).double()
+    out = leave_future_out(model, {"x": x, "u": u}, 2)
+    assert not out.error.any()
+    increments = model.filter({"x": x, "u": u}).filtered.log_evidence
+    torch.testing.assert_close(out.elpd, increments[:, 2:].sum(1), rtol=0, atol=1e-10)
+
+
 def test_densities_of_summed_out_chains_are_exact():
     model = linear_gaussian_surrogate("p(k_t | k_{t-1}) p(x_t | k_t)", "", {"k": Discrete(3), "x": 2}, T, scale=1.0)
     x = model.sample(4, T)["x"]
@@ -88,7 +99,7 @@ def test_intervals_of_estimates_cover_the_exact_density(monkeypatch, pair, horiz
     pyro.set_rng_seed(0)
     x = model.sample(count, T)["x"]
     exact = leave_future_out(model, x, 3, horizon).elpd
-    without_oracle(monkeypatch)
+    without_exact_filter(monkeypatch)
     out = leave_future_out(model, x, 3, horizon, 50)
     inside = (out.elpd - exact).abs() < scipy.special.stdtrit(REPLICATES - 1, 0.95) * out.error
     assert abs(inside.double().mean() - 0.9) < 4 * math.sqrt(0.09 / count)

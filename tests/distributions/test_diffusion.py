@@ -1,0 +1,405 @@
+"""Diffusion and flow matching: exact statements with the optimal denoiser of normal data, and the model contract."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+import dvae
+from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
+from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
+from dvae.networks.denoising import ragged_cosine_basis
+from dvae.testing import FactorizationContract
+from dvae.testing.device import move, on_device
+
+COVARIANCE = torch.tensor([[1.0, 0.6], [0.6, 0.5]], dtype=torch.float64)
+LOCATION = torch.tensor([0.5, -1.0], dtype=torch.float64)
+DATA = MultivariateNormal(LOCATION, COVARIANCE)
+COSINE = {"p(x)": Diffusion(denoiser=Denoiser(cosine=True))}
+JOINT = Denoiser(SelfAttention(width=8, heads=2))
+
+
+def optimal(z, angle, features, *steps):
+    """Return E[v | z] for normal data; with `steps`, the steps are independent."""
+    cos, sin = angle.cos(), angle.sin()
+    covariance = cos[..., None] ** 2 * COVARIANCE + sin[..., None] ** 2 * torch.eye(2, dtype=z.dtype)
+    whitened = torch.linalg.solve(covariance, (z - cos * LOCATION)[..., None])[..., 0]
+    return cos * sin * whitened - sin * (LOCATION + cos * whitened @ COVARIANCE)
+
+
+def build(spec, denoiser=optimal):
+    """Return a module without location and scale whose denoiser is known, and a function from rows to parameters."""
+    module = spec.build(Shape(2)).double()
+    del module.denoiser
+    object.__setattr__(module, "denoiser", denoiser)
+
+    def parameters(*rows):
+        zeros = torch.zeros(*rows, 2, dtype=torch.float64)
+        return zeros, zeros + 1, zeros[..., :0]
+
+    return module, parameters
+
+
+@pytest.mark.parametrize("schedule", ["learned", "cosine"])
+def test_the_bound_of_normal_data_is_tight(schedule):
+    module, parameters = build(Diffusion(schedule=schedule))
+    x = DATA.sample((500_000,))
+    gap = (DATA.log_prob(x) - module.distribution(parameters(len(x))).log_prob(x)).detach() / 2
+    error = gap.std() / math.sqrt(len(x))
+    assert error < 0.004
+    assert -3 * error < gap.mean() < 0.01 - 2 * error + 3 * error
+
+
+@pytest.mark.parametrize("spec", [Diffusion(log_snr=(-16.0, 10.0)), FlowMatching()])
+def test_the_density_of_the_ode_is_exact_and_its_estimate_is_within_its_error(spec):
+    module, parameters = build(spec)
+    x = DATA.sample((40,))
+    exact = module.distribution(parameters(40)).exact_log_prob(x, steps=100)
+    torch.testing.assert_close(exact.log_prob, DATA.log_prob(x), rtol=0, atol=2e-3)
+    assert (exact.standard_error == 0).all()
+    estimate = module.distribution(parameters(40)).exact_log_prob(x, steps=100, probes=64)
+    score = (estimate.log_prob - exact.log_prob) / estimate.standard_error
+    assert score.square().mean().sqrt() < 1.5
+    assert score.abs().max() < 5
+
+
+@pytest.mark.parametrize("spec", [Diffusion(sampler="ancestral", steps=400), Diffusion(), FlowMatching()])
+def test_draws_follow_the_distribution(spec):
+    module, parameters = build(spec)
+    draws = module.distribution(parameters(20_000)).sample()
+    torch.testing.assert_close(draws.mean(0), LOCATION, rtol=0, atol=0.04)
+    torch.testing.assert_close(draws.mT.cov(), COVARIANCE, rtol=0, atol=0.06)
+    torch.testing.assert_close(module.mean(parameters(1))[0].detach(), LOCATION, rtol=0, atol=0.02)
+
+
+def test_the_second_order_sampler_converges_faster_than_ddim():
+    noise = torch.randn(200, 2, dtype=torch.float64)
+
+    def draws(sampler, steps):
+        module, parameters = build(FlowMatching(sampler=sampler, steps=steps))
+        return module.draw(parameters(200), noise)
+
+    limit = draws("heun", 1000)
+    errors = {
+        sampler: [(draws(sampler, n) - limit).square().mean().sqrt() for n in (20, 40)] for sampler in ("ddim", "heun")
+    }
+    assert 1.6 < errors["ddim"][0] / errors["ddim"][1] < 2.5
+    assert errors["heun"][0] / errors["heun"][1] > 3
+
+
+def test_without_a_denoiser_it_is_a_normal_distribution():
+    module = Diffusion().build(Shape(2, 3)).double()
+    torch.nn.init.zeros_(module.denoiser.out.weight)
+    torch.nn.init.zeros_(module.denoiser.out.bias)
+    parameters = module(torch.randn(6, 3, dtype=torch.float64))
+    x, normal = torch.randn(6, 2, dtype=torch.float64), torch.distributions.Normal(*parameters[:2])
+    torch.testing.assert_close(
+        module.distribution(parameters).log_prob(x), normal.log_prob(x).sum(-1), rtol=0, atol=1e-3
+    )
+
+
+def test_a_change_of_unit_changes_the_density_by_its_jacobian():
+    module, x = Diffusion().build(Shape(2, 3)).double(), torch.randn(6, 2, dtype=torch.float64)
+    mean, scale = torch.tensor([5.0, -1.0]).double(), torch.tensor([0.1, 30.0]).double()
+    parameters = module(torch.randn(6, 3, dtype=torch.float64))
+    rescaled, noise = module.rescale(parameters, mean, scale), torch.randn_like(x)
+    expected = module.distribution(parameters).exact_log_prob(x).log_prob - scale.log().sum()
+    torch.testing.assert_close(module.distribution(rescaled).exact_log_prob(mean + scale * x).log_prob, expected)
+    torch.testing.assert_close(module.draw(rescaled, noise), mean + scale * module.draw(parameters, noise))
+
+
+def bimodal(n):
+    """Return draws (n, 1, 1) around -1 and 1, three in ten around -1."""
+    signs = torch.where(torch.rand(n, 1, 1) < 0.3, -1.0, 1.0)
+    return signs + 0.1 * torch.randn(n, 1, 1)
+
+
+@pytest.mark.parametrize("spec", [Diffusion(hidden=(32, 32)), FlowMatching(hidden=(32, 32))])
+def test_training_keeps_the_mass_of_both_modes(spec):
+    model = dvae.DynamicalVAE("p(x_t)", "", {"x": 1}, distributions={"p(x)": spec})
+    optimiser = torch.optim.Adam(model.parameters(), lr=4e-3)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.0, 1500)
+    head = model.generator["x"].head
+    for _ in range(1500):
+        optimiser.zero_grad()
+        (-head.distribution(head(torch.empty(512, 0))).log_prob(bimodal(512)[:, 0]).mean()).backward()
+        optimiser.step()
+        schedule.step()
+    draws = model.sample(2000, length=1)["x"].flatten()
+    assert (draws < 0).float().mean() == pytest.approx(0.3, abs=0.05)
+    assert ((draws.abs() - 1).abs() < 0.4).float().mean() > 0.95
+    x = bimodal(400)
+    parts = torch.distributions.Normal(torch.tensor([-1.0, 1.0]), 0.1).log_prob(x) + torch.tensor([0.3, 0.7]).log()
+    truth = parts.logsumexp(-1).mean()
+    density = model.rollout(x).evaluate("x", x).exact_log_prob(x).log_prob.mean()
+    assert density == pytest.approx(truth.item(), abs=0.2)
+    if model.likelihood:
+        terms = dvae.SequenceELBO(num_particles=20).terms(model, x)
+        assert terms.bounded == ("x",)
+        assert terms.bound.mean() < truth + 0.1
+
+
+def freeze(model):
+    """Replace the random levels and noise of every denoiser by functions of the value, so that scores can be compared.
+
+    The functions keep gradients. All steps that are denoised jointly have the same level.
+    """
+    for conditional in model.generator.values():
+        head = conditional.head
+
+        def perturb(u, joint=conditional.joint):
+            times = 0.5 + 0.4 * (2 * u.sum(-1, keepdim=True)).sin()
+            return torch.full_like(times[..., :1, :], 0.4) if joint else times, (3 * u).sin()
+
+        if hasattr(head, "perturb"):
+            head.perturb = perturb
+    return model
+
+
+class TestAllGenerativeFactorsAreDiffusions(FactorizationContract):
+    """Static prior, transition and emission."""
+
+    missing = {}  # noqa: RUF012
+    training_steps = 20
+
+    def build(self, size):
+        spec = Diffusion(hidden=(4,), steps=3)
+        return freeze(
+            dvae.DynamicalVAE(
+                "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t)",
+                "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{t:T}, w)",
+                {"w": size, "z": size, "x": size},
+                network=Recurrent(width=5),
+                distributions={"p(w)": spec, "p": spec},
+            )
+        )
+
+
+class TestItsEmissionReadsItsOwnPast(FactorizationContract):
+    """An emission with a residual and a fixed schedule."""
+
+    training_steps = 20
+
+    def build(self, size):
+        spec = Diffusion(hidden=(4,), steps=3, residual=1.0, schedule="cosine")
+        pair = "p(z_t | z_{t-1}) p(x_t | x_{<t}, z_t)", "q(z_t | x_{1:T})"
+        sizes = {"z": size, "x": size}
+        return freeze(dvae.DynamicalVAE(*pair, sizes, network=Recurrent(width=5), distributions={"p(x)": spec}))
+
+
+class TestItsEmissionIsTrainedByFlowMatching(FactorizationContract):
+    """The loss is declared a density here, so that every test of a density applies to it."""
+
+    training_steps = 20
+
+    def build(self, size):
+        pair, spec = ("p(w) p(x_t | x_{<t}, w)", "q(w | x_{1:T})"), FlowMatching(hidden=(4,), steps=3)
+        sizes = {"w": size, "x": size}
+        model = freeze(dvae.DynamicalVAE(*pair, sizes, network=Recurrent(width=5), distributions={"p(x)": spec}))
+        model.generator["x"].head.density = "exact"
+        return model
+
+
+class OneDistributionOfAllSteps(FactorizationContract):
+    """Base of contracts of emissions that are drawn jointly."""
+
+    training_steps = 20
+    spec = Diffusion(denoiser=JOINT, steps=3)
+
+    def test_the_log_joint_is_that_of_the_per_step_program(self):
+        pytest.skip("the shares of the steps in a joint bound are not conditional densities")
+
+    def test_every_size_may_be_one(self):
+        model = self._model(1)
+        assert model.log_joint({"x": torch.randn(1, 1, 1)}, {"w": torch.randn(1, 1).double()})["x"].isfinite()
+        assert model.sample(1, length=1)["x"].isfinite().all()
+
+    def test_a_bound_stays_on_its_device(self):
+        """As in the contract, with draws in place of a forecast given past steps."""
+        model = self._model()
+        data = self._data(model)
+        with on_device() as traffic:
+            move(model)
+            device_data = {name: value.to("cuda") for name, value in data.items()}
+            for _ in range(2):
+                traffic.clear()
+                dvae.SequenceELBO().terms(model, device_data).bound.sum().backward()
+            assert not traffic.uploads
+            model.sample(2, length=4)
+
+    def test_training_stays_finite(self):
+        pytest.skip("this test forecasts given past steps, which a distribution of all steps does not support")
+
+
+@pytest.mark.parametrize("network", [SelfAttention(width=8, heads=2), Recurrent(width=4)])
+def test_cosine_coefficients_are_another_basis_of_the_same_noise(network):
+    """Padding changes nothing, and the basis of each sequence is orthonormal."""
+    spec = Diffusion(denoiser=Denoiser(network, cosine=True), steps=2)
+    model = freeze(dvae.DynamicalVAE("p(x_{1:T})", "", {"x": 2}, distributions={"p(x)": spec}).double())
+    x, lengths = torch.randn(3, 5, 2).double(), torch.tensor([5, 3, 1])
+    logs = model.log_joint({"x": x, "lengths": lengths}, {})["x"]
+    for i, n in enumerate(lengths):
+        torch.testing.assert_close(logs[i : i + 1], model.log_joint(x[i : i + 1, :n], {})["x"])
+    basis = ragged_cosine_basis(lengths, 5, torch.float64)
+    identity = (torch.arange(5) < lengths[:, None]).double().diag_embed()
+    torch.testing.assert_close(basis @ basis.mT, identity)
+
+
+class TestItsEmissionIsOneDiffusion(OneDistributionOfAllSteps):
+    """p(w) p(x_{1:T} | w)."""
+
+    def build(self, size):
+        pair = "p(w) p(x_{1:T} | w)", "q(w | x_{1:T})"
+        distributions = {"p(x)": self.spec}
+        sizes = {"w": size, "x": size}
+        return freeze(dvae.DynamicalVAE(*pair, sizes, network=Recurrent(width=5), distributions=distributions))
+
+
+@pytest.mark.parametrize("network", [Attention(8, 2), SelfAttention(8, 2), Recurrent(width=8)])
+@pytest.mark.parametrize(("steps", "causal"), [("{<=t}", True), ("{1:T}", False)])
+def test_the_masks_hold_at_every_level_and_for_draws(network, steps, causal):
+    factor = f"p(x_t | x_{{<t}}, h_{steps})"
+    distributions = {"p(x)": Diffusion(denoiser=Denoiser(network), steps=3)}
+    model = dvae.DynamicalVAE(factor, "", {"x": 2, "h": 1}, Attention(8, 2), distributions).double()
+    z, noise, h = torch.randn(1, 5, 2).double(), torch.randn(1, 5, 2).double(), torch.randn(1, 5, 1).double()
+    conditional = model.generator["x"]
+
+    def depends(function, value):
+        jacobian = torch.autograd.functional.jacobian(function, value)  # (1, T, D, 1, S, D)
+        return (jacobian != 0).any(-1).any(2)[0, :, 0]
+
+    expected = torch.ones(5, 5).bool().tril() if causal else torch.ones(5, 5).bool()
+    for angle in (0.01, 0.8, 1.55):
+        level = torch.full((1, 1, 1), angle).double()
+
+        def velocity(h, z=z, level=level):
+            _, _, features, observed = conditional({"h": h}, 1, 5)
+            return conditional.head.denoiser(z, level, features, observed)
+
+        assert torch.equal(depends(velocity, h), expected)
+        assert torch.equal(depends(lambda z: velocity(h, z), z), expected)
+    assert torch.equal(depends(lambda h: conditional.draw(conditional({"h": h}, 1, 5), noise), h), expected)
+
+
+@pytest.mark.parametrize("kind", [Diffusion, FlowMatching])
+def test_missing_steps_and_padding_change_nothing_else(kind):
+    spec = kind(denoiser=JOINT, steps=2)
+    model = freeze(dvae.DynamicalVAE("p(x_{1:T} | s)", "", {"x": 2, "s": 1}, distributions={"p(x)": spec}).double())
+    x, s = torch.randn(2, 5, 2).double(), torch.randn(2, 1).double()
+
+    def score(x, **options):
+        terms = dvae.SequenceELBO().terms(model, {"x": x, "s": s, **options})
+        return (terms.log_likelihood | terms.energies)["x"]
+
+    ragged = x.clone()
+    ragged[:, 3:] = math.nan
+    torch.testing.assert_close(score(ragged, lengths=torch.tensor([3, 3])), score(x[:, :3]))
+    mask = torch.ones_like(x).bool()
+    mask[:, 1] = False
+    hidden = torch.where(mask, x, math.nan)
+    other = torch.where(mask, x, 7.0)
+    torch.testing.assert_close(score(hidden, mask=mask), score(other, mask=mask))
+    assert not torch.allclose(score(hidden, mask=mask), score(x))
+    run = model.rollout({"x": other, "s": s, "mask": mask})
+    value = run.values["x"]
+    density = run.evaluate("x", value).exact_log_prob(value, steps=5)
+    assert density.log_prob.shape == (2,)
+    for draw in (True, False):
+        with pytest.raises(ValueError, match="cannot be imputed"):
+            model.impute({"x": other, "s": s, "mask": mask}, draw=draw)
+    with pytest.raises(ValueError, match="jointly, and not given some"):
+        model.forecast({"x": x, "s": s}, 2)
+
+
+def test_a_predictor_forecasts_whole_futures():
+    pair, spec = ("p(x_{1:T} | s)", ""), Diffusion(denoiser=JOINT, steps=2)
+    view = dvae.data.views.Past("s", 3)
+    model = dvae.DynamicalVAE(*pair, {"x": 2, "s": 6}, distributions={"p(x)": spec}, view=view)
+    assert model.forecast(torch.randn(4, 3, 2), 5, samples=2)["x"].shape == (2, 4, 5, 2)
+    latent = dvae.DynamicalVAE(
+        "p(w) p(x_{1:T} | w, s)", "q(w | x_{1:T}, s)", {"w": 1, "x": 2, "s": 6}, distributions={"p(x)": spec}, view=view
+    )
+    windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=3)
+    result = dvae.evaluate(latent, windows, samples=3, progress=False)
+    assert any("stochastic lower bound" in note for note in result.notes)
+    with pytest.raises(ValueError, match="stochastic lower bound"):
+        dvae.iwae_bound(latent, torch.randn(4, 8, 2))
+    result = dvae.compare({"latent": latent}, windows, particles=1, contrasts=0, samples=2, progress=False)
+    assert any("stochastic lower bound" in note for note in result.rows["latent"].notes)
+
+
+def test_per_step_emissions_forecast_and_impute():
+    for spec in (Diffusion(hidden=(4,), steps=2), FlowMatching(hidden=(4,), steps=2)):
+        model = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2}, distributions={"p(x)": spec})
+        x, mask = torch.randn(3, 6, 2), torch.ones(3, 6, 2).bool()
+        assert model.forecast(x, 3, samples=2)["x"].shape == (2, 3, 3, 2)
+        mask[:, 2] = False
+        filled = model.impute({"x": x, "mask": mask}, samples=2)["x"]
+        assert torch.equal(filled[:, mask], x[mask].expand(2, -1))
+        assert (filled[0, :, 2] != filled[1, :, 2]).all()
+
+
+def test_guidance_moves_draws_away_from_the_unconditional_denoiser():
+    spec = Diffusion(drop=0.5, guidance=1.0, steps=5)
+    plain, guided = spec.build(Shape(2, 3)), Diffusion(drop=0.5, guidance=3.0, steps=5).build(Shape(2, 3))
+    guided.load_state_dict(plain.state_dict())
+    parameters, noise = plain(torch.randn(6, 3)), torch.randn(6, 2)
+    hidden = (*parameters[:2], torch.zeros_like(parameters[2]))
+    assert not torch.allclose(plain.draw(parameters, noise), guided.draw(parameters, noise))
+    torch.testing.assert_close(plain.draw(hidden, noise), guided.draw(hidden, noise))
+    loc = plain(torch.randn(6, 3))[0]
+    assert torch.equal(loc[:1].expand_as(loc), loc)  # otherwise location and scale would reveal the parents
+
+
+def test_a_loss_is_an_energy_and_has_no_bound():
+    spec = FlowMatching(hidden=(4,))
+    model = dvae.DynamicalVAE("p(z) p(x_t | z)", "q(z | x_{1:T})", {"z": 1, "x": 2}, distributions={"p(x)": spec})
+    terms = dvae.SequenceELBO().terms(model, torch.randn(3, 4, 2))
+    assert not model.likelihood
+    assert not terms.likelihood
+    assert (terms.energies["x"] > 0).all()
+    with pytest.raises(ValueError, match="no log joint"):
+        model.log_joint(torch.randn(3, 4, 2), {"z": torch.randn(3, 1)})
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Diffusion(steps=0).build(Shape(2)), "`steps` of at least 1"),
+        (lambda: Diffusion(schedule="linear").build(Shape(2)), "schedule"),
+        (lambda: Diffusion(log_snr=(3.0, 1.0)).build(Shape(2)), "increasing"),
+        (lambda: Diffusion(guidance=2.0).build(Shape(2, 1)), "set `drop` above 0"),
+        (lambda: Diffusion(drop=0.1).build(Shape(2)), "no parents"),
+        (lambda: FlowMatching(sampler="ancestral").build(Shape(2)), "'ddim' or 'heun'"),
+        (lambda: Diffusion(denoiser=JOINT).build(Shape(2)), "denoiser=None"),
+        (lambda: joint("p(x_t | x_{<t}, z_{<=t}) p(z_t)", "q(z_t | x_{1:T})", COSINE), "cosine=False"),
+        (lambda: Product([((0,), FlowMatching()), ((1,), Normal())]).build(Shape(2)), "no density"),
+        (lambda: joint("p(x_t | z_t) p(z_t)", "q(z_t | x_{1:T})"), "needs a factor such as"),
+        (lambda: joint("p(x_t | x_{<t}, z_t) p(z_t)", "q(z_t | x_{1:T})"), "needs a factor such as"),
+        (lambda: joint("p(z) p(x_t | z)", "q(z | x_{1:T})", {"q(z)": Diffusion()}), "bound in place of a density"),
+        (lambda: joint("p(z) p(x_t | z)", "q(z | x_{1:T})", {"p(z)": FlowMatching()}), "loss in place of a density"),
+    ],
+)
+def test_mistakes_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_a_network_is_not_a_denoiser():
+    with pytest.raises(TypeError, match="such as networks"):
+        joint("p(z) p(x_{1:T} | z)", "q(z | x_{1:T})", {"p(x)": Diffusion(denoiser=SelfAttention())})
+
+
+def test_one_diffusion_is_the_prior_of_a_latent_sequence():
+    pair, spec = ("p(z_{1:T}) p(x_t | z_t)", "q(z_t | x_{1:T})"), Diffusion(denoiser=JOINT, steps=2)
+    model = dvae.DynamicalVAE(*pair, {"z": 2, "x": 3}, distributions={"p(z)": spec})
+    terms = dvae.SequenceELBO().terms(model, torch.randn(3, 5, 3))
+    assert terms.bounded == ("z",)
+    assert terms.kl["z"].isfinite().all()
+    assert model.sample(2, length=4)["x"].shape == (2, 4, 3)
+
+
+def joint(generative, inference, distributions=None):
+    distributions = distributions or {"p(x)": Diffusion(denoiser=JOINT)}
+    return dvae.DynamicalVAE(generative, inference, {"x": 2, "z": 1}, distributions=distributions)
