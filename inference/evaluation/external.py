@@ -258,7 +258,7 @@ def _item(item: Any, name: str) -> tuple[Tensor, tuple[str, ...], str, Any]:
 
 def _key(key: Any, name: str) -> Key:
     parts = key if isinstance(key, tuple) else ()
-    if len(parts) not in (2, 3):
+    if len(parts) not in (2, 3) or float(parts[-1]) % 1:
         raise ValueError(f"{name!r} has the key {key!r}; expected (split, sequence, first step) of a window")
     return (str(parts[0]) if len(parts) == 3 else "", str(parts[-2]), int(parts[-1]))
 
