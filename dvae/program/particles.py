@@ -491,17 +491,20 @@ class Stepwise:
         if self.given is None:
             parameters, self.state = self.conditional.step(self.state, t, samples)
             return parameters
-        values = {n: value if value.dim() == 2 else value[:, : t + 1] for n, value in self.given.items()}
+        relations = [parent.relation for parent in self.conditional.factor.parents if parent.relation is not None]
+        lags = [int(bool(self.conditional.head.residual)), *(relation.lag for relation in relations)]
+        first = max(t - max(lags), 0)  # step t reads no earlier ones
+        values = {n: value if value.dim() == 2 else value[:, first : t + 1] for n, value in self.given.items()}
         empty = {**self.conditional.sizes, self.conditional.factor.child: self.conditional.size}
         for name, rows in samples.items():
-            steps = [rows[s] for s in range(t + 1)]
+            steps = [rows[s] for s in range(first, t + 1)]
             some = next((step for step in steps if step is not None), None)
             if some is None and name in empty:
                 some = like(self.conditional).new_zeros(self.rows, empty[name])
             if some is not None:  # a value that is not drawn yet, or a mask of a complete step
                 fill = torch.full_like(some, some.dtype is torch.bool)
                 values[name] = torch.stack([fill if step is None else step for step in steps], 1)
-        return tuple(p[:, t] for p in self.conditional(values, self.rows, t + 1))
+        return tuple(p[:, -1] for p in self.conditional(values, self.rows, t + 1 - first))
 
     def logits(self, parameters: Parameters, t: int) -> Tensor:
         """Return log probabilities (N, J) of a summed-out variable in the joint states."""

@@ -35,6 +35,22 @@ def masked(x, share=0.3):
     return {"x": x, "mask": torch.rand(x.shape) > share}
 
 
+def test_a_long_fixed_lag_evaluates_no_more_steps(monkeypatch):
+    pair = "p(z_t | z_{t-2:t-1}) p(x_t | x_{t-1}, z_t)", "q(z_t | z_{t-2:t-1}, x_t)"
+    model = build(pair, {"z": 2, "x": 2}, Attention(4, heads=1))
+    x, lengths = torch.randn(2, 12, 2, dtype=DOUBLE), list[int]()
+    for part in (*model.generator.values(), *model.encoder.values()):
+
+        def counting(parents, length, *rest, forward=part.network.forward):
+            lengths.append(length)
+            return forward(parents, length, *rest)
+
+        monkeypatch.setattr(part.network, "forward", counting)
+    short, long = (model.filter(x, 8, seed=0, lag=lag).filtered for lag in (1, 9))
+    assert max(lengths) == 3
+    torch.testing.assert_close(short.log_evidence, long.log_evidence, rtol=0, atol=1e-12)
+
+
 # ------------------------------------------------------------------------------------------------------ exact filters
 
 LINEAR = {
