@@ -156,8 +156,10 @@ def forecast(
         f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
     )
     ERROR.print(f"largest step of a joint to the first future frame: {_steps(written, unblended, 1)}")
-    if blend > 1:
-        ERROR.print(f"largest step of a joint in {blend} blended frames: {_steps(written, unblended, blend)}")
+    if blend:  # with the step after them, which has the jump if they are few
+        ERROR.print(
+            f"largest step of a joint in and after {blend} blended frames: {_steps(written, unblended, blend + 1)}"
+        )
     if protocol.root != "drop":
         ERROR.print(_travel(written))
     _save_futures(blended, figure)

@@ -94,6 +94,11 @@ def test_the_command_blends_only_if_asked(run, tmp_path, capsys):
     np.testing.assert_array_equal(blended.forecasts[:, :, 5:], plain.forecasts[:, :, 5:])
     steps = f"{1000 * blended.largest_steps()[0]:.0f} mm ({1000 * plain.largest_steps()[0]:.0f} mm before blending)"
     assert f"first future frame: {steps}, in the true motion" in notes
+    later, before = (1000 * each.largest_steps(6)[0] for each in (blended, plain))  # with the step after the blend
+    assert f"in and after 5 blended frames: {later:.0f} mm ({before:.0f} mm before blending)" in notes
+    assert main([*command, str(tmp_path / "d.npz"), "--blend", "1"]) == 0
+    later = 1000 * motion.Forecasts.load(tmp_path / "d.npz").largest_steps(2)[0]
+    assert f"in and after 1 blended frames: {later:.0f} mm" in " ".join(capsys.readouterr().err.split())
     assert main(["evaluate", str(run), "--forecasts", str(tmp_path / "a.npz")]) == 0
     assert main(["evaluate", str(run), "--forecasts", str(tmp_path / "b.npz")]) == 2
     assert "its first 5 steps are blended" in " ".join(capsys.readouterr().err.split())
