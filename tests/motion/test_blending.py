@@ -7,6 +7,7 @@ import pytest
 
 from dvae import motion
 from dvae.cli import main
+from dvae.cli.futures import _travel
 
 OBSERVED, HORIZON = 8, 30
 
@@ -55,6 +56,8 @@ def test_a_future_that_continues_at_constant_velocity_is_not_changed(futures):
     continued = replace(futures, observed=observed + steps[:OBSERVED], forecasts=moving[None, :, OBSERVED:])
     np.testing.assert_allclose(continued.blended(12).forecasts, continued.forecasts, atol=1e-7)
     assert continued.largest_steps(5)[0] == pytest.approx(0.02 * 1.25**0.5)
+    faster = replace(continued, skeleton=replace(motion.WALKER, fps=50.0))  # 30 steps of 22.4 mm, at 50 Hz
+    assert "travels 0.67 m at 1.12 m/s" in _travel(faster)
 
 
 def test_missing_joints_start_as_in_the_future(futures):
