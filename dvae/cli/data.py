@@ -87,7 +87,8 @@ def convert(
         recorded: frames per second of the files, if they state a wrong rate.
         skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
         units: units of some of the files, such as a.bvh=cm b.npz=m, in m, cm, mm, in, or metres per unit.
-        prefix: start the names of clips with the name of their archive, or of the folder of their recording.
+        prefix: start the names of clips with the name of their archive; for recordings, folders, and archives with
+            equal names, with the name of the folder that contains them.
     """
     target = _skeleton(onto)
     if files in ((), (SIMULATED,)):
@@ -146,6 +147,8 @@ def _units(texts: Sequence[str], files: Sequence[str]) -> dict[Path, float]:
             raise UsageError(f"--units {text}: expected FILE={', FILE='.join(lengths)} or FILE=METRES") from None
         if file not in files:
             raise UsageError(f"--units {text}: {file or 'no file'} is not among the files: {', '.join(files)}")
+    if len(units) < len(texts):
+        raise UsageError(f"--units {' '.join(texts)}: give each file one unit")
     return units
 
 

@@ -103,8 +103,8 @@ def forecast(
         data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         figure: save a figure of the first window's futures.
         beyond: for a table: forecast the steps after its last row with a target, using covariates of later rows.
-        blend: for motion: number of first frames that pass from the observed motion to the future, so that no joint
-            jumps. Do not score blended forecasts.
+        blend: for motion: number of first frames that pass from the observed motion to the future, without a jump at
+            the seam. Do not score blended forecasts.
     """
     at_least(0, blend=blend)
     at_least(1, samples=samples, horizon=horizon)
@@ -156,8 +156,10 @@ def forecast(
         f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
     )
     ERROR.print(f"largest step of a joint to the first future frame: {_steps(written, unblended, 1)}")
-    if blend > 1:
-        ERROR.print(f"largest step of a joint in {blend} blended frames: {_steps(written, unblended, blend)}")
+    if blend:  # with the step after them, which has the jump if they are few
+        ERROR.print(
+            f"largest step of a joint in and after {blend} blended frames: {_steps(written, unblended, blend + 1)}"
+        )
     if protocol.root != "drop":
         ERROR.print(_travel(written))
     _save_futures(blended, figure)

@@ -291,14 +291,17 @@ def draw_flow(
         coordinates: the two coordinates of z.
 
     Raises:
-        ValueError: if the model has other equations, or z has no such coordinates.
+        ValueError: if the model has other equations, networks or covariates, or z has no such coordinates.
     """
     import matplotlib.pyplot as plt
 
     if model.generative.text != RSLDS.generative:
         raise ValueError(f"a flow needs the model {RSLDS.generative}, but this model is {model.generative.text}")
     size, states = model.sizes["z"], model.sizes["k"]
-    if len(set(coordinates)) != 2 or not set(coordinates) <= set(range(size)):
+    dynamics, transitions = model.generator["z"].network, model.generator["k"].head.out
+    if not isinstance(dynamics, SwitchingNetwork) or transitions.in_features != states + size:
+        raise ValueError("a flow needs a model that dvae.method('rslds') built, without covariates")
+    if len(coordinates) != 2 or len(set(coordinates)) != 2 or not set(coordinates) <= set(range(size)):
         raise ValueError(f"`coordinates` must be two of the {size} coordinates of z, from 0; got {coordinates}")
     data = model.read(batch)
     z = model.guide(data)["z"]
@@ -311,9 +314,9 @@ def draw_flow(
     at[:, list(coordinates)] = grid
     each = torch.eye(states).to(z)
     inputs = torch.cat([each.expand(len(at), -1, -1), at[:, None].expand(-1, states, -1)], -1)
-    chains = model.generator["k"].head.out(inputs).double().softmax(-1)
+    chains = transitions(inputs).double().softmax(-1)
     state = torch.linalg.matrix_power(chains, 2**20).mean(1).argmax(-1)
-    moves = (model.generator["z"].network.features_at(each[state], at)[:, :size] - at)[:, list(coordinates)]
+    moves = (dynamics.features_at(each[state], at)[:, :size] - at)[:, list(coordinates)]
     ax = plt.figure(layout="constrained").add_subplot() if ax is None else ax
     ax.plot(*plane.mT, ".", color="0.8", markersize=1, zorder=0)
     ax.quiver(*grid.mT, *moves.mT, color=[f"C{k}" for k in state.tolist()], angles="xy")

@@ -7,6 +7,7 @@ import pytest
 
 from dvae import motion
 from dvae.cli import main
+from dvae.cli.futures import _travel
 
 OBSERVED, HORIZON = 8, 30
 
@@ -55,6 +56,8 @@ def test_a_future_that_continues_at_constant_velocity_is_not_changed(futures):
     continued = replace(futures, observed=observed + steps[:OBSERVED], forecasts=moving[None, :, OBSERVED:])
     np.testing.assert_allclose(continued.blended(12).forecasts, continued.forecasts, atol=1e-7)
     assert continued.largest_steps(5)[0] == pytest.approx(0.02 * 1.25**0.5)
+    faster = replace(continued, skeleton=replace(motion.WALKER, fps=50.0))  # 30 steps of 22.4 mm, at 50 Hz
+    assert "travels 0.67 m at 1.12 m/s" in _travel(faster)
 
 
 def test_missing_joints_start_as_in_the_future(futures):
@@ -94,6 +97,11 @@ def test_the_command_blends_only_if_asked(run, tmp_path, capsys):
     np.testing.assert_array_equal(blended.forecasts[:, :, 5:], plain.forecasts[:, :, 5:])
     steps = f"{1000 * blended.largest_steps()[0]:.0f} mm ({1000 * plain.largest_steps()[0]:.0f} mm before blending)"
     assert f"first future frame: {steps}, in the true motion" in notes
+    later, before = (1000 * each.largest_steps(6)[0] for each in (blended, plain))  # with the step after the blend
+    assert f"in and after 5 blended frames: {later:.0f} mm ({before:.0f} mm before blending)" in notes
+    assert main([*command, str(tmp_path / "d.npz"), "--blend", "1"]) == 0
+    later = 1000 * motion.Forecasts.load(tmp_path / "d.npz").largest_steps(2)[0]
+    assert f"in and after 1 blended frames: {later:.0f} mm" in " ".join(capsys.readouterr().err.split())
     assert main(["evaluate", str(run), "--forecasts", str(tmp_path / "a.npz")]) == 0
     assert main(["evaluate", str(run), "--forecasts", str(tmp_path / "b.npz")]) == 2
     assert "its first 5 steps are blended" in " ".join(capsys.readouterr().err.split())

@@ -42,6 +42,7 @@ SAME = 1e-3
 """Tolerance in metres within which two files have the same rest pose."""
 
 BENDS = "rotations are left out, because a joint moves relative to its parent"
+REST_POSES = "rotations are left out, because rest poses differ"
 
 LIKE = 1.6
 """Maximum ratio of body sizes in one folder; below 2.54, to detect inches among centimetres."""
@@ -426,7 +427,7 @@ class Collected:
         """Return a description of how the files were interpreted."""
         sentences = [f"{world}, a person of {np.median(self._extents):.2f} m"]
         if not self._same_rest and BENDS not in self._notes:
-            sentences.append("rotations are left out, because rest poses differ")
+            sentences.append(REST_POSES)
         for note, paths in self._notes.items():
             several = f" in {len(paths)} of {len(self._extents)} files, the first {paths[0].name}"
             sentences.append(note + several * (len(self._extents) > 1))
@@ -445,7 +446,10 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
     first, up = sets[0][0], sets[0][1].skeleton.up
     for path, motion in sets:
         if motion.skeleton.up != up:
-            raise ValueError(f"{path}: its up axis is {motion.skeleton.up}, but {up} in {first}; pass onto=")
+            raise ValueError(
+                f"{path}: its up axis is {motion.skeleton.up}, but {up} in {first}; give onto= "
+                "(`dvae data convert --onto`)"
+            )
         skipped += motion.skipped
         for clip in motion:
             if reason := collected.add(path, clip, motion.skeleton):
@@ -453,7 +457,7 @@ def joined_motion(sets: Sequence[tuple[Path, MotionSet]], name: str) -> MotionSe
             if (earlier := paths.setdefault(clip.key, path)) != path:
                 raise ValueError(
                     f"the clip {'/'.join(clip.key)} occurs twice, in {earlier} and {path}; start names of clips with "
-                    "the name of their archive or folder, with `dvae data convert --prefix`"
+                    "the name of their archive or folder (`dvae data convert --prefix`), or rename these"
                 )
             clips.append(clip)
     return collected.motion(clips, skipped=skipped, missing=any(motion.missing for _, motion in sets))

@@ -19,7 +19,7 @@ from ..data.clips import Clip, MotionSet, extents
 from ..geometry.skeleton import Skeleton, brief
 from .arrays import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
 from .bvh import write_bvh
-from .reading import Collected, File, FileReader, find_files, joined_motion, read_motion, rotate_up, sampled
+from .reading import REST_POSES, Collected, File, FileReader, find_files, joined_motion, read_motion, rotate_up, sampled
 from .recording import Recording
 from .smpl import write_amass
 from .world import infer_world
@@ -170,7 +170,8 @@ def convert(
         skip_bad: leave out unusable clips.
         missing: keep clips in which joints are missing (NaN) in some frames.
         units: metres per unit of some sources; `metres` is for the others.
-        prefix: start the names of clips with the name of their archive, or of the folder of their recording.
+        prefix: start the names of clips with the name of their archive; for recordings, folders, and archives with
+            equal names, with the name of the folder that contains them.
 
     Returns:
         A summary in words, with the unit of each source.
@@ -196,6 +197,9 @@ def convert(
             notes.append(f"{source}: " + "; ".join(filter(None, [assumed * (not inner), motion.interpretation])))
             motions.append((source, _renamed(motion, source, sources, prefix, archive=not inner)))
         motion = motions[0][1] if len(motions) == 1 else joined_motion(motions, out.stem)
+        had_rotations = any(clip.rotations is not None for _, each in motions for clip in each)
+        if had_rotations and motion.clips[0].rotations is None:
+            notes.append(REST_POSES)
         paths = write_motion(out, motion, format)
         return f"{len(motion)} clips in {len(paths)} files; {len(motion.skipped)} skipped; {'; '.join(notes)}"
     if out.suffix and format != "npz" and len(files) > 1:

@@ -18,7 +18,7 @@ import dvae
 from dvae.data.schema import Schema
 from dvae.distributions import FAMILIES
 from dvae.inference.training.recipe import fit_factor
-from dvae.models.family.rslds import SwitchingLinear, cluster, draw_flow, principal_path, start_regimes
+from dvae.models.family.rslds import RSLDS, SwitchingLinear, cluster, draw_flow, principal_path, start_regimes
 from dvae.networks import Dense
 
 
@@ -238,6 +238,11 @@ def test_wrong_uses_are_an_error():
         draw_flow(build(), torch.zeros(1, 3, 3))
     with pytest.raises(ValueError, match="two of the 2 coordinates of z"):
         draw_flow(build(recurrent=True), torch.zeros(1, 3, 3), coordinates=(0, 2))
+    with pytest.raises(ValueError, match="two of the 2 coordinates of z"):
+        draw_flow(build(recurrent=True), torch.zeros(1, 3, 3), coordinates=(0, 1, 1))
+    other = dvae.DynamicalVAE(RSLDS.generative, RSLDS.inference, {"k": dvae.Discrete(2), "z": 2, "x": 3})
+    with pytest.raises(ValueError, match=r"dvae\.method\('rslds'\) built, without covariates"):
+        draw_flow(other, torch.zeros(1, 3, 3))
     pair = "p(k_t | k_{t-1}) p(z_t | z_{t-1}, k_t) p(x_t | z_t)", "q(z_t | x_t)"
     sizes, networks = {"k": dvae.Discrete(2), "z": 2, "x": 2}, {"p(z)": SwitchingLinear(), "default": Dense()}
     with pytest.raises(ValueError, match="switching dynamics need"):

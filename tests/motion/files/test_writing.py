@@ -221,6 +221,11 @@ def test_files_with_their_own_units_are_merged(walkers, tmp_path, capsys):
     assert "--units FILE=0.01" in error
     for option, message in (("c.npz=cm", "c.npz is not among the files"), (f"{paths[0]}=ell", "expected FILE=m")):
         assert message in notes("--units", option, code=2)
+    assert "give each file one unit" in notes("--units", f"{paths[0]}=m", f"{paths[0]}=cm", code=2)
+    write_motion(tmp_path / "d.bvh", second)  # with another rest pose
+    assert main(["data", "convert", paths[0], str(tmp_path / "d.bvh"), *command[4:], "--units", f"{paths[0]}=cm"]) == 0
+    assert "rotations are left out, because rest poses differ" in " ".join(capsys.readouterr().err.split())
+    assert read_motion(tmp_path / "all.npz").clips[0].rotations is None
 
 
 def test_clips_of_the_same_name_get_a_prefix(walkers, recordings, tmp_path, capsys):

@@ -106,9 +106,10 @@ def test_constant_rates_are_straight_lines_and_circles():
     torch.testing.assert_close(turned, expected)
 
 
-def test_a_straight_walk_has_its_speed_and_covers_its_distance(simulated):
+@pytest.mark.parametrize("fps", [30.0, 50.0])
+def test_a_straight_walk_has_its_speed_and_covers_its_distance(simulated, fps):
     data = motion.windows(simulated, PROTOCOL, "train")
-    view, fps = data.schema.view, data.skeleton.fps
+    view = Travel(replace(data.skeleton, fps=fps))
     time = torch.arange(50, dtype=torch.float64) / fps
     ahead = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     poses = data.positions(data.all()["x"].double())[:, :1] + 1.4 * time[:, None, None] * ahead
