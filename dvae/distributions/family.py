@@ -146,6 +146,21 @@ class VonMises(dist.VonMises):  # type: ignore[misc]
         return narrow.sample(torch.Size(sample_shape))  # type: ignore[no-any-return]
 
 
+class OneHotCategorical(dist.OneHotCategorical):  # type: ignore[misc]
+    """Torch's distribution, without the validation of its logits, which waits for the device."""
+
+    def __init__(self, probs: Any = None, logits: Any = None, validate_args: bool | None = None):
+        self._categorical = plain.Categorical(probs, logits, validate_args=False)
+        shapes = self._categorical.batch_shape, self._categorical.param_shape[-1:]
+        Distribution.__init__(self, *shapes, validate_args=validate_args)
+
+    def expand(self, batch_shape: Any, _instance: object = None) -> OneHotCategorical:
+        """Return the distribution with another batch shape."""
+        return OneHotCategorical(logits=self.logits.expand(*batch_shape, -1), validate_args=False)
+
+
+REPLACED = {dist.VonMises: VonMises, dist.OneHotCategorical: OneHotCategorical}
+"""Our versions of distributions."""
 OPEN: Mapping[type[Distribution], Any] = {
     plain.Gamma: constraints.positive,
     **dict.fromkeys((plain.Beta, plain.Kumaraswamy, plain.RelaxedBernoulli), Interior(constraints.unit_interval)),
@@ -238,7 +253,7 @@ class FamilyModule(ConditionalDistribution):
     def __init__(self, spec: Family, shape: Shape):
         super().__init__(spec.residual)
         self.error_weight = spec.error_weight
-        self.kind: Any = VonMises if spec.kind is dist.VonMises else spec.kind
+        self.kind: Any = REPLACED.get(spec.kind, spec.kind)
         self.given: dict[str, Any] = dict(spec.given)
         self.floors = {"scale": spec.min_scale, "cov_diag": spec.min_scale**2}
         if "validate_args" in inspect.signature(self.kind.__init__).parameters:

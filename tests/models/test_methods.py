@@ -107,13 +107,11 @@ class TestKVAE(Contract):
 
 class TestRSLDS(Contract):
     name = "rslds"
-    waits = 2  # torch checks the probabilities of the states
     missing: ClassVar = {"z": ("z_{<=t-2}",)}
 
 
 class TestSLDS(Contract):
     name = "rslds"
-    waits = 2
     options: ClassVar = {"recurrent": False}
     missing: ClassVar = {"z": ("z_{<=t-2}",)}
 

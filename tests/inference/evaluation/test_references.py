@@ -94,7 +94,8 @@ def test_windows_have_all_references_whose_needs_are_met(gaps):
     assert list(run(test).rows) == ["last value", "seasonal"]
     assert list(run(replace(test, season=8)).rows) == ["last value"]  # of 7 observed frames
     assert list(run(replace(test, season=8), season=7).rows) == ["last value", "seasonal"]
-    assert run(test, references=False).rows == {}
+    with pytest.raises(ValueError, match="expected at least one model, forecast or reference to score"):
+        run(test, references=False)
 
 
 def test_references_are_selected_by_name_or_are_errors():
