@@ -28,16 +28,19 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import WHOLE
+from ...data.schema import Schema
 from ...data.views import Past, View, Views
 from ...distributions import Diffusion, DistributionSpec
 from ...inference.training.objectives import Evidence, Objective
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...motion import Heading, Skeleton
+from ...motion.data.protocols import Poses
 from ...networks import Denoiser, Input, NetworkSpec, SelfAttention
 from ...networks.base import FixedLengthNetwork, perceptron
 from ...networks.loop import memoize
 from ...options import Amount, Count, Extra, Layers, Positive, Range, Size
+from ...program.batch import AnyBatch
 from ..baselines.moglow_paths import Offsets
 from ..method import fit_units
 from .futures import HISTORY, FutureMethod, FutureModel, LastState
@@ -52,14 +55,14 @@ class MotionDenoiser(FutureMethod):
         latent, beta: always None; the method has no latents.
         join: always 0; a forecast is a draw, which has no mean pose.
         width: width of the transformer and of the code of h.
-        heads, layers: attention heads and layers of the transformer.
+        heads_count, layers: attention heads and layers of the transformer.
         coefficients: number of cosine coefficients that the transformer reads; 0 to denoise frames instead.
         schedule: "learned" or "cosine", as in `Diffusion`.
         sampler: "heun", "ddim" or "ancestral".
         sampler_steps: number of steps of the sampler.
         drop: probability that training hides h, for guidance.
         guidance: weight of h in forecasts; above 1 needs `drop`, and forecasts no longer follow the density.
-        min_scale: smallest standard deviation of x without a denoiser, in units of the data.
+        min_scale: lower bound of the scale of x without a denoiser, for standardised poses.
     """
 
     name = "denoiser"
@@ -75,7 +78,7 @@ class MotionDenoiser(FutureMethod):
     latent: None = None
     beta: None = None
     width: Size = 128
-    heads: Size = 4
+    heads_count: Size = 4
     layers: Layers = 3
     coefficients: Extra = 20
     schedule: Literal["learned", "cosine"] = "learned"
@@ -88,9 +91,13 @@ class MotionDenoiser(FutureMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.join:
-            raise ValueError(f"join is {self.join}, but {self.name} draws forecasts and has no means; leave `join` at 0")
-        if self.width % self.heads:
-            raise ValueError(f"width must be a multiple of heads, got width={self.width} and heads={self.heads}")
+            raise ValueError(
+                f"join is {self.join}, but {self.name} draws forecasts and has no means; leave `join` at 0"
+            )
+        if self.width % self.heads_count:
+            raise ValueError(
+                f"width must be a multiple of heads_count, got width={self.width} and heads_count={self.heads_count}"
+            )
 
     @override
     def sizes(self) -> dict[str, int]:
@@ -103,7 +110,7 @@ class MotionDenoiser(FutureMethod):
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
-        network = SelfAttention(self.width, self.heads, self.layers, positions="sinusoids")
+        network = SelfAttention(self.width, self.heads_count, self.layers, positions="sinusoids")
         return {
             "p(x)": Diffusion(
                 denoiser=Denoiser(network, self.coefficients > 0, self.coefficients or None),
@@ -117,11 +124,22 @@ class MotionDenoiser(FutureMethod):
         }
 
     @override
+    def build(self, data: Any) -> FutureModel:
+        model, schema = super().build(data), Schema.of(data)
+        if isinstance(schema, Poses):
+            model.horizon = schema.frames - schema.protocol.observed
+        return model
+
+    @override
+    def kind(self) -> type[FutureModel]:
+        return MotionDenoiserModel
+
+    @override
     def _build_model(self, size: int, frames: int, skeleton: Skeleton | None = None) -> FutureModel:
         views: list[View] = [Heading(skeleton, frames)] if skeleton and self.heading else []
         views += [Past(HISTORY, frames), *([Offsets(HISTORY)] if skeleton else [])]
         arguments = self.model_arguments({WHOLE: size, HISTORY: frames * size})
-        model = FutureModel(self, frames, skeleton, view=Views(*views), **arguments)
+        model = self.kind()(self, frames, skeleton, view=Views(*views), **arguments)
         model.standardise(WHOLE)
         return model
 
@@ -133,6 +151,31 @@ class MotionDenoiser(FutureMethod):
     @override
     def objective(self) -> Objective:
         return Evidence()
+
+
+class MotionDenoiserModel(FutureModel):
+    """A diffusion model of as many future frames as in training; shorter forecasts are the first frames of these."""
+
+    horizon: int | None = None
+    """T, number of future frames; None if unknown."""
+
+    @torch.no_grad()
+    @override
+    def forecast(self, batch: AnyBatch, horizon: int, samples: int = 1, **options: Any) -> dict[str, Tensor]:
+        """Forecast up to T frames.
+
+        Raises:
+            ValueError: if the batch has another number of observed frames, or the horizon is too long.
+        """
+        data, most = self.read(batch), horizon if self.horizon is None else self.horizon
+        if WHOLE in data or not 1 <= horizon <= most:
+            given = self.frames + (data[WHOLE].shape[1] if WHOLE in data else 0)
+            raise ValueError(
+                f"this model reads {self.frames} frames and predicts up to {most} more; got {given} frames and a "
+                f"horizon of {horizon}"
+            )
+        draws = super().forecast(data, most, samples, **options)
+        return {name: value[:, :, :horizon] for name, value in draws.items()}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import dvae
 from dvae import motion
 from dvae.testing import FactorizationContract
 
-SMALL = {"width": 8, "heads": 2, "layers": 1, "coefficients": 4, "sampler_steps": 3}
+SMALL = {"width": 8, "heads_count": 2, "layers": 1, "coefficients": 4, "sampler_steps": 3}
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +90,18 @@ def test_forecasts_are_seeded_draws(windows, options):
     assert (forecasts[0].std(0) > 0).all()
 
 
+def test_a_shorter_forecast_is_the_start_of_a_whole_one(windows):
+    model, batch = built(windows), batch_of(windows)
+    forecasts = []
+    for horizon in (3, 7):
+        torch.manual_seed(1)
+        forecasts.append(model.forecast(past_of(batch), horizon, 2)["x"])
+    assert torch.equal(forecasts[0], forecasts[1][:, :, :3])
+    for wrong, horizon, message in ((past_of(batch), 8, "up to 7 more.*horizon of 8"), (batch, 2, "got 12 frames")):
+        with pytest.raises(ValueError, match=message):
+            model.forecast(wrong, horizon)
+
+
 def test_a_run_is_restored_with_the_same_forecasts(windows, tmp_path):
     protocol = windows.protocol
     people = motion.MotionData("simulated", motion.simulate(clips=8, frames=40, test=0.3), protocol)
@@ -125,7 +137,7 @@ def test_futures_keep_the_mass_of_both_modes():
     ("options", "message"),
     [
         ({"join": 1.0}, "leave `join` at 0"),
-        ({"width": 9}, "multiple of heads"),
+        ({"width": 9}, "multiple of heads_count"),
         ({"guidance": 2.0}, "set `drop` above 0"),
     ],
 )
