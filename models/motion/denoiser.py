@@ -125,10 +125,10 @@ class MotionDenoiser(FutureMethod):
 
     @override
     def build(self, data: Any) -> FutureModel:
-        model, schema = super().build(data), Schema.of(data)
-        if isinstance(schema, Poses):
+        model: Any = super().build(data)
+        if isinstance(schema := Schema.of(data), Poses):
             model.horizon = schema.frames - schema.protocol.observed
-        return model
+        return model  # type: ignore[no-any-return]
 
     @override
     def kind(self) -> type[FutureModel]:
