@@ -34,11 +34,14 @@ class Denoiser(DenoiserSpec):
         cosine: whether the network reads and returns cosine coefficients over time instead of steps.
         coefficients: number of lowest coefficients that the network reads; the others are independent normal variables.
             None for all.
+        from_zero: whether the values continue from 0 before the first step. The coefficients then belong to sines that
+            are 0 there (the type VII discrete sine transform) instead of cosines.
     """
 
     network: NetworkSpec = field(default_factory=SelfAttention)
     cosine: bool = False
     coefficients: int | None = None
+    from_zero: bool = False
 
     @override
     def build(self, shape: Shape) -> SequenceDenoiser:
@@ -48,9 +51,11 @@ class Denoiser(DenoiserSpec):
             shape: the variable, its features, and the steps that its value at t may depend on.
 
         Raises:
-            ValueError: `cosine` is set, but steps may not depend on all others; or `coefficients` is below 1, or set
-                without `cosine`.
+            ValueError: `cosine` is set, but steps may not depend on all others; or `coefficients` is below 1; or
+                `coefficients` or `from_zero` is set without `cosine`.
         """
+        if self.from_zero and not self.cosine:
+            raise ValueError("from_zero=True selects the basis of the coefficients and needs cosine=True")
         if self.coefficients is not None and (self.coefficients < 1 or not self.cosine):
             raise ValueError(
                 f"`coefficients` is a number of at least 1 and needs cosine=True, got coefficients={self.coefficients} "
@@ -77,6 +82,7 @@ class SequenceDenoiser(nn.Module):
     def __init__(self, spec: Denoiser, shape: Shape):
         super().__init__()
         self.cosine, self.coefficients = spec.cosine, spec.coefficients
+        self.basis = ragged_sine_basis if spec.from_zero else ragged_cosine_basis
         frame = Input("frame", shape.size + shape.features + 1, shape.relation)
         self.network = spec.network.build([frame, Input("level", LEVEL_SIZE)], True, shape.size)
         self.out = small_linear(self.network.features, shape.size)
@@ -102,7 +108,7 @@ class SequenceDenoiser(nn.Module):
         return v.to(frames.dtype)
 
     def _in_frequency(self, z: Tensor, angle: Tensor, others: Tensor, lengths: Tensor, level: Tensor) -> Tensor:
-        basis = ragged_cosine_basis(lengths, z.shape[1], z.dtype)
+        basis = self.basis(lengths, z.shape[1], z.dtype)
         steps = torch.arange(1, z.shape[1] + 1, dtype=z.dtype, device=z.device)
         scale = (self.log_scale - self.slope * steps.log()[:, None]).exp()
         spread = (angle.cos() * scale).square() + angle.sin().square()
@@ -119,4 +125,12 @@ def ragged_cosine_basis(lengths: Tensor, length: int, dtype: torch.dtype) -> Ten
     steps = torch.arange(length, dtype=dtype, device=lengths.device)
     n, k = lengths.to(dtype)[:, None, None], steps[:, None]
     basis = (math.pi * (steps + 0.5) * k / n).cos() * ((k > 0) + 1.0).sqrt() / n.sqrt()
+    return basis * ((k < n) & (steps < n))
+
+
+def ragged_sine_basis(lengths: Tensor, length: int, dtype: torch.dtype) -> Tensor:
+    """Return the orthonormal DST-VII matrix (B, T, T) of the valid steps of each sequence, 0 elsewhere."""
+    steps = torch.arange(length, dtype=dtype, device=lengths.device)
+    n, k = lengths.to(dtype)[:, None, None], steps[:, None]
+    basis = 2 * (math.pi * (2 * k + 1) * (steps + 1) / (2 * n + 1)).sin() / (2 * n + 1).sqrt()
     return basis * ((k < n) & (steps < n))

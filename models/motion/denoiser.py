@@ -3,7 +3,7 @@
     p(x_{1:T} | h),  no latents and no guide
 
 x are the poses after the last observed one, relative to it, and h the observed poses. A transformer denoises the lowest
-cosine coefficients of x over time, given h. `log_prob` is a bound (`distributions.Diffusion`), and forecasts are draws.
+sine coefficients of x over time, given h. `log_prob` is a bound (`distributions.Diffusion`), and forecasts are draws.
 
 HumanMAC (Chen et al., 2023, arXiv 2302.03665) has the transformer on cosine coefficients with h as a condition. It
 completes one sequence of past and future, omits high coefficients, and sets a cosine schedule. SkeletonDiffusion
@@ -12,6 +12,7 @@ There are no layers or weights of either paper here. Ours:
 
 * The likelihood: a bound with a learned schedule and Gaussian high coefficients, so that x has a density.
 * Each coefficient is denoised in units of its own learned scale (`networks.Denoiser`).
+* Sines in place of cosines (DST-VII), because x continues from 0.
 * h enters by its code, and by the pose t steps before the last one as a feature of x_t.
 * Windows are rotated so that the last observed pose faces one way.
 """
@@ -56,7 +57,7 @@ class MotionDenoiser(FutureMethod):
         join: always 0; a forecast is a draw, which has no mean pose.
         width: width of the transformer and of the code of h.
         heads_count, layers: attention heads and layers of the transformer.
-        coefficients: number of cosine coefficients that the transformer reads; 0 to denoise frames instead.
+        coefficients: number of sine coefficients that the transformer reads; 0 to denoise frames instead.
         schedule: "learned" or "cosine", as in `Diffusion`.
         sampler: "heun", "ddim" or "ancestral".
         sampler_steps: number of steps of the sampler.
@@ -111,9 +112,10 @@ class MotionDenoiser(FutureMethod):
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
         network = SelfAttention(self.width, self.heads_count, self.layers, positions="sinusoids")
+        in_frequency = self.coefficients > 0
         return {
             "p(x)": Diffusion(
-                denoiser=Denoiser(network, self.coefficients > 0, self.coefficients or None),
+                denoiser=Denoiser(network, in_frequency, self.coefficients or None, from_zero=in_frequency),
                 schedule=self.schedule,
                 steps=self.sampler_steps,
                 sampler=self.sampler,
