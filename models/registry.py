@@ -38,6 +38,7 @@ METHODS = {
     "aclstm": "dvae.models.baselines.aclstm:ACLSTM",
     "hit-dvae": "dvae.models.motion.hit_dvae:HiTDVAE",
     "gsps": "dvae.models.motion.gsps:GSPS",
+    "denoiser": "dvae.models.motion.denoiser:MotionDenoiser",
     "trajevae": "dvae.models.motion.trajevae:TrajeVAE",
     "cvae-rnn": "dvae.models.baselines.cvae_rnn:CVAERNN",
     "motion-infilling": "dvae.models.baselines.motion_infilling:MotionInfilling",

@@ -2,6 +2,11 @@
 
 The network reads noisy frames under the masks of the factor. With cosine coefficients, it denoises in the frequency
 domain, as HumanMAC does (Chen et al., 2023, arXiv 2302.03665). The transform is orthonormal, so the noise is the same.
+
+Coefficient k of coordinate d then has a normal model with standard deviation r = exp(a_d) (k + 1)^-b_d, where a and b
+are learned. The network f estimates what this model does not explain (Karras et al., 2022, arXiv 2206.00364):
+
+    v = cos(a) sin(a) (1 - r^2) / q^2 z + r / q f(z / q),        q^2 = cos^2(a) r^2 + sin^2(a)
 """
 
 from __future__ import annotations
@@ -27,10 +32,16 @@ class Denoiser(DenoiserSpec):
     Args:
         network: network over time, which also reads the noise level.
         cosine: whether the network reads and returns cosine coefficients over time instead of steps.
+        coefficients: number of lowest coefficients that the network reads; the others are independent normal variables.
+            None for all.
+        from_zero: whether the values continue from 0 before the first step. The coefficients then belong to sines that
+            are 0 there (the type VII discrete sine transform) instead of cosines.
     """
 
     network: NetworkSpec = field(default_factory=SelfAttention)
     cosine: bool = False
+    coefficients: int | None = None
+    from_zero: bool = False
 
     @override
     def build(self, shape: Shape) -> SequenceDenoiser:
@@ -40,14 +51,22 @@ class Denoiser(DenoiserSpec):
             shape: the variable, its features, and the steps that its value at t may depend on.
 
         Raises:
-            ValueError: `cosine` is set, but steps may not depend on all others.
+            ValueError: `cosine` is set, but steps may not depend on all others; or `coefficients` is below 1; or
+                `coefficients` or `from_zero` is set without `cosine`.
         """
+        if self.from_zero and not self.cosine:
+            raise ValueError("from_zero=True selects the basis of the coefficients and needs cosine=True")
+        if self.coefficients is not None and (self.coefficients < 1 or not self.cosine):
+            raise ValueError(
+                f"`coefficients` is a number of at least 1 and needs cosine=True, got coefficients={self.coefficients} "
+                f"and cosine={self.cosine}"
+            )
         if self.cosine and shape.relation != ALL:
             raise ValueError(
                 f"cosine coefficients contain all steps, but {shape.name} has a parent that is restricted to the past; "
                 "use cosine=False"
             )
-        return SequenceDenoiser(self.network, shape, self.cosine)
+        return SequenceDenoiser(self, shape)
 
 
 class SequenceDenoiser(nn.Module):
@@ -56,30 +75,49 @@ class SequenceDenoiser(nn.Module):
     A frame of its input consists of the noisy value, the features, and an indicator of an observed step.
 
     Args:
-        network: description of the network.
+        spec: description of the denoiser.
         shape: the variable and its features; its `relation` contains the frames that step t reads.
-        cosine: whether the network reads and returns cosine coefficients over time instead of steps.
     """
 
-    def __init__(self, network: NetworkSpec, shape: Shape, cosine: bool):
+    def __init__(self, spec: Denoiser, shape: Shape):
         super().__init__()
-        self.cosine = cosine
+        self.cosine, self.coefficients = spec.cosine, spec.coefficients
+        self.basis = ragged_sine_basis if spec.from_zero else ragged_cosine_basis
         frame = Input("frame", shape.size + shape.features + 1, shape.relation)
-        self.network = network.build([frame, Input("level", LEVEL_SIZE)], True, shape.size)
+        self.network = spec.network.build([frame, Input("level", LEVEL_SIZE)], True, shape.size)
         self.out = small_linear(self.network.features, shape.size)
+        if self.cosine:
+            self.log_scale = nn.Parameter(torch.zeros(shape.size))
+            self.slope = nn.Parameter(torch.ones(shape.size))
 
     def forward(self, z: Tensor, angle: Tensor, features: Tensor, steps: Tensor) -> Tensor:
         """Return v (..., T, D) for z (..., T, D), angles (..., 1, 1), features (..., T, H) and steps (..., T, 1)."""
-        frames = torch.cat([torch.where(steps > 0, z, 0.0), features, (steps > 0).to(z.dtype)], -1)
-        frames = torch.where(steps < 0, 0.0, frames)
-        lengths, frames = (steps >= 0).sum((-2, -1)).flatten(), frames.flatten(0, -3)
-        basis = ragged_cosine_basis(lengths, z.shape[-2], z.dtype) if self.cosine else None
-        frames = frames if basis is None else basis @ frames
-        parents = {"frame": frames, "level": embed_level(angle[..., 0, :]).flatten(0, -2)}
-        v: Tensor = self.out(self.network(parents, z.shape[-2], lengths)).to(z.dtype)
-        v = v if basis is None else basis.mT @ v
+        observed, others = torch.where(steps > 0, z, 0.0), torch.cat([features, (steps > 0).to(z.dtype)], -1)
+        others = torch.where(steps < 0, 0.0, others).flatten(0, -3)
+        lengths, observed = (steps >= 0).sum((-2, -1)).flatten(), observed.flatten(0, -3)
+        level = embed_level(angle[..., 0, :]).flatten(0, -2)
+        if self.cosine:
+            v = self._in_frequency(observed, angle.flatten(0, -3), others, lengths, level)
+        else:
+            v = self._network(torch.cat([observed, others], -1), level, lengths)
         reshaped: Tensor = v.unflatten(0, z.shape[:-2])
         return reshaped
+
+    def _network(self, frames: Tensor, level: Tensor, lengths: Tensor) -> Tensor:
+        v: Tensor = self.out(self.network({"frame": frames, "level": level}, frames.shape[1], lengths))
+        return v.to(frames.dtype)
+
+    def _in_frequency(self, z: Tensor, angle: Tensor, others: Tensor, lengths: Tensor, level: Tensor) -> Tensor:
+        basis = self.basis(lengths, z.shape[1], z.dtype)
+        steps = torch.arange(1, z.shape[1] + 1, dtype=z.dtype, device=z.device)
+        scale = (self.log_scale - self.slope * steps.log()[:, None]).exp()
+        spread = (angle.cos() * scale).square() + angle.sin().square()
+        z, n = basis @ z, min(self.coefficients or z.shape[1], z.shape[1])
+        v = angle.cos() * angle.sin() * (1 - scale.square()) / spread * z
+        whitened = (z / spread.sqrt())[:, :n]
+        update = self._network(torch.cat([whitened, basis[:, :n] @ others], -1), level, lengths.clamp(max=n))
+        update = (scale / spread.sqrt())[:, :n] * update
+        return basis.mT @ torch.cat([v[:, :n] + update, v[:, n:]], 1)
 
 
 def ragged_cosine_basis(lengths: Tensor, length: int, dtype: torch.dtype) -> Tensor:
@@ -87,4 +125,12 @@ def ragged_cosine_basis(lengths: Tensor, length: int, dtype: torch.dtype) -> Ten
     steps = torch.arange(length, dtype=dtype, device=lengths.device)
     n, k = lengths.to(dtype)[:, None, None], steps[:, None]
     basis = (math.pi * (steps + 0.5) * k / n).cos() * ((k > 0) + 1.0).sqrt() / n.sqrt()
+    return basis * ((k < n) & (steps < n))
+
+
+def ragged_sine_basis(lengths: Tensor, length: int, dtype: torch.dtype) -> Tensor:
+    """Return the orthonormal DST-VII matrix (B, T, T) of the valid steps of each sequence, 0 elsewhere."""
+    steps = torch.arange(length, dtype=dtype, device=lengths.device)
+    n, k = lengths.to(dtype)[:, None, None], steps[:, None]
+    basis = 2 * (math.pi * (2 * k + 1) * (steps + 1) / (2 * n + 1)).sin() / (2 * n + 1).sqrt()
     return basis * ((k < n) & (steps < n))

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
 
+from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import WHOLE, Batch
@@ -94,21 +95,34 @@ class MoGlowPaths(TrajectoryMethod):
         return replace(recipe, prepare=partial(start_flow, windows=recipe.batches))
 
 
+@dataclass(frozen=True)
 class Offsets(View):
-    """A view that counts the poses x (B, T, D) from the first pose s (B, D)."""
+    """A view that counts the poses x (B, T, D) from the last pose of a context variable.
 
+    Args:
+        source: name of the variable, (B, D), or (B, O D) for several poses.
+    """
+
+    source: str = FIRST
     names = (ORIGIN,)
 
     @override
     def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
-        origin = data.get(FIRST) if view_inputs is None else view_inputs.get(ORIGIN)
+        origin = data.get(self.source) if view_inputs is None else view_inputs.get(ORIGIN)
         if ORIGIN in data or origin is None:
             return data
-        moved = {WHOLE: data[WHOLE] - origin[:, None]} if WHOLE in data else {}
+        moved = {WHOLE: data[WHOLE] - _last(origin, data[WHOLE])} if WHOLE in data else {}
         return data | moved | {ORIGIN: origin}
 
     @override
     def inverse(self, model_values: Batch) -> Batch:
         data = Batch(model_values)
         origin = data.pop(ORIGIN, None)
-        return data if origin is None or WHOLE not in data else data | {WHOLE: data[WHOLE] + origin[:, None]}
+        if origin is None or WHOLE not in data:
+            return data
+        return data | {WHOLE: data[WHOLE] + _last(origin, data[WHOLE])}
+
+
+def _last(poses: Tensor, like: Tensor) -> Tensor:
+    """Return the last of poses (B, O D) as (B, 1, D), for values `like` (..., D)."""
+    return poses[:, None, -like.shape[-1] :]

@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal
 import dvae
 from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
 from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
-from dvae.networks.denoising import ragged_cosine_basis
+from dvae.networks.denoising import ragged_cosine_basis, ragged_sine_basis
 from dvae.testing import FactorizationContract
 from dvae.testing.device import move, on_device
 
@@ -241,9 +241,28 @@ def test_cosine_coefficients_are_another_basis_of_the_same_noise(network):
     logs = model.log_joint({"x": x, "lengths": lengths}, {})["x"]
     for i, n in enumerate(lengths):
         torch.testing.assert_close(logs[i : i + 1], model.log_joint(x[i : i + 1, :n], {})["x"])
-    basis = ragged_cosine_basis(lengths, 5, torch.float64)
     identity = (torch.arange(5) < lengths[:, None]).double().diag_embed()
-    torch.testing.assert_close(basis @ basis.mT, identity)
+    for basis in (ragged_cosine_basis, ragged_sine_basis):
+        matrix = basis(lengths, 5, torch.float64)
+        torch.testing.assert_close(matrix @ matrix.mT, identity)
+
+
+@pytest.mark.parametrize("from_zero", [False, True])
+def test_coefficients_that_the_network_does_not_change_are_independent_normal_variables(from_zero):
+    spec = Diffusion(denoiser=Denoiser(cosine=True, coefficients=2, from_zero=from_zero), log_snr=(-16.0, 16.0))
+    model = dvae.DynamicalVAE("p(x_{1:T})", "", {"x": 2}, distributions={"p(x)": spec}).double()
+    denoiser = model.generator["x"].head.denoiser
+    for parameter in denoiser.out.parameters():
+        torch.nn.init.zeros_(parameter)
+    denoiser.log_scale.data = torch.tensor([0.3, -0.2]).double()
+    x = torch.randn(3, 5, 2).double()
+    rollout = model.rollout(x)
+    loc, scale, *_ = rollout.parameters("x", x)
+    deviations = torch.exp(denoiser.log_scale - denoiser.slope * torch.arange(1, 6).log()[:, None])
+    basis = (ragged_sine_basis if from_zero else ragged_cosine_basis)(torch.tensor([5]), 5, torch.float64)
+    coefficients = torch.distributions.Normal(0.0, deviations).log_prob(basis @ ((x - loc) / scale))
+    exact = rollout.evaluate("x", x).exact_log_prob(x, steps=200).log_prob
+    torch.testing.assert_close(exact, (coefficients - scale.log()).sum((1, 2)).detach(), rtol=0, atol=2e-3)
 
 
 class TestItsEmissionIsOneDiffusion(OneDistributionOfAllSteps):

@@ -423,7 +423,10 @@ def test_unknown_methods_and_options_are_an_error(run, message):
         run()
 
 
-NEEDS = r"missing 1 required positional argument|sizes missing for|needs the description of poses|batch must contain"
+NEEDS = (
+    r"missing 1 required positional argument|sizes missing for|needs the description of poses|batch must contain|"
+    r"this model reads"
+)
 
 
 @pytest.mark.parametrize("name", dvae.methods())
