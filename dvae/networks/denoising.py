@@ -1,6 +1,6 @@
 """Denoiser: any network over time, as the denoiser of a joint distribution of all steps (`distributions.Diffusion`).
 
-The network reads noisy frames under the masks of the factor. With cosine coefficients, it denoises in the frequency
+The network reads noisy frames under the masks of the factor. With a basis, it denoises coefficients in the frequency
 domain, as HumanMAC does (Chen et al., 2023, arXiv 2302.03665). The transform is orthonormal, so the noise is the same.
 
 Coefficient k of coordinate d then has a normal model with standard deviation r = exp(a_d) (k + 1)^-b_d, where a and b
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -31,17 +32,16 @@ class Denoiser(DenoiserSpec):
 
     Args:
         network: network over time, which also reads the noise level.
-        cosine: whether the network reads and returns cosine coefficients over time instead of steps.
+        basis: the network reads and returns coefficients over time instead of steps: of the type II discrete "cosine"
+            transform; or of the type VII discrete "sine" transform, for values that continue from 0 before the first
+            step. None for steps.
         coefficients: number of lowest coefficients that the network reads; the others are independent normal variables.
             None for all.
-        from_zero: whether the values continue from 0 before the first step. The coefficients then belong to sines that
-            are 0 there (the type VII discrete sine transform) instead of cosines.
     """
 
     network: NetworkSpec = field(default_factory=SelfAttention)
-    cosine: bool = False
+    basis: Literal["cosine", "sine"] | None = None
     coefficients: int | None = None
-    from_zero: bool = False
 
     @override
     def build(self, shape: Shape) -> SequenceDenoiser:
@@ -51,20 +51,20 @@ class Denoiser(DenoiserSpec):
             shape: the variable, its features, and the steps that its value at t may depend on.
 
         Raises:
-            ValueError: `cosine` is set, but steps may not depend on all others; or `coefficients` is below 1; or
-                `coefficients` or `from_zero` is set without `cosine`.
+            ValueError: `basis` is unknown, or set although steps may not depend on all others; or `coefficients` is
+                below 1, or set without `basis`.
         """
-        if self.from_zero and not self.cosine:
-            raise ValueError("from_zero=True selects the basis of the coefficients and needs cosine=True")
-        if self.coefficients is not None and (self.coefficients < 1 or not self.cosine):
+        if self.basis not in (None, *BASES):
+            raise ValueError(f"`basis` must be 'cosine', 'sine' or None, got {self.basis!r}")
+        if self.coefficients is not None and (self.coefficients < 1 or not self.basis):
             raise ValueError(
-                f"`coefficients` is a number of at least 1 and needs cosine=True, got coefficients={self.coefficients} "
-                f"and cosine={self.cosine}"
+                f"`coefficients` is a number of at least 1 and needs a basis, got coefficients={self.coefficients} "
+                f"and basis={self.basis!r}"
             )
-        if self.cosine and shape.relation != ALL:
+        if self.basis and shape.relation != ALL:
             raise ValueError(
-                f"cosine coefficients contain all steps, but {shape.name} has a parent that is restricted to the past; "
-                "use cosine=False"
+                f"{self.basis} coefficients contain all steps, but {shape.name} has a parent that is restricted to the "
+                "past; use basis=None"
             )
         return SequenceDenoiser(self, shape)
 
@@ -81,12 +81,11 @@ class SequenceDenoiser(nn.Module):
 
     def __init__(self, spec: Denoiser, shape: Shape):
         super().__init__()
-        self.cosine, self.coefficients = spec.cosine, spec.coefficients
-        self.basis = ragged_sine_basis if spec.from_zero else ragged_cosine_basis
+        self.basis, self.coefficients = spec.basis and BASES[spec.basis], spec.coefficients
         frame = Input("frame", shape.size + shape.features + 1, shape.relation)
         self.network = spec.network.build([frame, Input("level", LEVEL_SIZE)], True, shape.size)
         self.out = small_linear(self.network.features, shape.size)
-        if self.cosine:
+        if self.basis:
             self.log_scale = nn.Parameter(torch.zeros(shape.size))
             self.slope = nn.Parameter(torch.ones(shape.size))
 
@@ -96,7 +95,7 @@ class SequenceDenoiser(nn.Module):
         others = torch.where(steps < 0, 0.0, others).flatten(0, -3)
         lengths, observed = (steps >= 0).sum((-2, -1)).flatten(), observed.flatten(0, -3)
         level = embed_level(angle[..., 0, :]).flatten(0, -2)
-        if self.cosine:
+        if self.basis:
             v = self._in_frequency(observed, angle.flatten(0, -3), others, lengths, level)
         else:
             v = self._network(torch.cat([observed, others], -1), level, lengths)
@@ -108,6 +107,7 @@ class SequenceDenoiser(nn.Module):
         return v.to(frames.dtype)
 
     def _in_frequency(self, z: Tensor, angle: Tensor, others: Tensor, lengths: Tensor, level: Tensor) -> Tensor:
+        assert self.basis
         basis = self.basis(lengths, z.shape[1], z.dtype)
         steps = torch.arange(1, z.shape[1] + 1, dtype=z.dtype, device=z.device)
         scale = (self.log_scale - self.slope * steps.log()[:, None]).exp()
@@ -134,3 +134,6 @@ def ragged_sine_basis(lengths: Tensor, length: int, dtype: torch.dtype) -> Tenso
     n, k = lengths.to(dtype)[:, None, None], steps[:, None]
     basis = 2 * (math.pi * (2 * k + 1) * (steps + 1) / (2 * n + 1)).sin() / (2 * n + 1).sqrt()
     return basis * ((k < n) & (steps < n))
+
+
+BASES = {"cosine": ragged_cosine_basis, "sine": ragged_sine_basis}

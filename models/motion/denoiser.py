@@ -112,10 +112,10 @@ class MotionDenoiser(FutureMethod):
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
         network = SelfAttention(self.width, self.heads_count, self.layers, positions="sinusoids")
-        in_frequency = self.coefficients > 0
+        basis: Literal["sine"] | None = "sine" if self.coefficients else None
         return {
             "p(x)": Diffusion(
-                denoiser=Denoiser(network, in_frequency, self.coefficients or None, from_zero=in_frequency),
+                denoiser=Denoiser(network, basis, self.coefficients or None),
                 schedule=self.schedule,
                 steps=self.sampler_steps,
                 sampler=self.sampler,

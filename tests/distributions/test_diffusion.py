@@ -9,14 +9,14 @@ from torch.distributions import MultivariateNormal
 import dvae
 from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
 from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
-from dvae.networks.denoising import ragged_cosine_basis, ragged_sine_basis
+from dvae.networks.denoising import BASES
 from dvae.testing import FactorizationContract
 from dvae.testing.device import move, on_device
 
 COVARIANCE = torch.tensor([[1.0, 0.6], [0.6, 0.5]], dtype=torch.float64)
 LOCATION = torch.tensor([0.5, -1.0], dtype=torch.float64)
 DATA = MultivariateNormal(LOCATION, COVARIANCE)
-COSINE = {"p(x)": Diffusion(denoiser=Denoiser(cosine=True))}
+COSINE = {"p(x)": Diffusion(denoiser=Denoiser(basis="cosine"))}
 JOINT = Denoiser(SelfAttention(width=8, heads=2))
 
 
@@ -235,21 +235,21 @@ class OneDistributionOfAllSteps(FactorizationContract):
 @pytest.mark.parametrize("network", [SelfAttention(width=8, heads=2), Recurrent(width=4)])
 def test_cosine_coefficients_are_another_basis_of_the_same_noise(network):
     """Padding changes nothing, and the basis of each sequence is orthonormal."""
-    spec = Diffusion(denoiser=Denoiser(network, cosine=True), steps=2)
+    spec = Diffusion(denoiser=Denoiser(network, basis="cosine"), steps=2)
     model = freeze(dvae.DynamicalVAE("p(x_{1:T})", "", {"x": 2}, distributions={"p(x)": spec}).double())
     x, lengths = torch.randn(3, 5, 2).double(), torch.tensor([5, 3, 1])
     logs = model.log_joint({"x": x, "lengths": lengths}, {})["x"]
     for i, n in enumerate(lengths):
         torch.testing.assert_close(logs[i : i + 1], model.log_joint(x[i : i + 1, :n], {})["x"])
     identity = (torch.arange(5) < lengths[:, None]).double().diag_embed()
-    for basis in (ragged_cosine_basis, ragged_sine_basis):
+    for basis in BASES.values():
         matrix = basis(lengths, 5, torch.float64)
         torch.testing.assert_close(matrix @ matrix.mT, identity)
 
 
-@pytest.mark.parametrize("from_zero", [False, True])
-def test_coefficients_that_the_network_does_not_change_are_independent_normal_variables(from_zero):
-    spec = Diffusion(denoiser=Denoiser(cosine=True, coefficients=2, from_zero=from_zero), log_snr=(-16.0, 16.0))
+@pytest.mark.parametrize("name", BASES)
+def test_coefficients_that_the_network_does_not_change_are_independent_normal_variables(name):
+    spec = Diffusion(denoiser=Denoiser(basis=name, coefficients=2), log_snr=(-16.0, 16.0))
     model = dvae.DynamicalVAE("p(x_{1:T})", "", {"x": 2}, distributions={"p(x)": spec}).double()
     denoiser = model.generator["x"].head.denoiser
     for parameter in denoiser.out.parameters():
@@ -259,7 +259,7 @@ def test_coefficients_that_the_network_does_not_change_are_independent_normal_va
     rollout = model.rollout(x)
     loc, scale, *_ = rollout.parameters("x", x)
     deviations = torch.exp(denoiser.log_scale - denoiser.slope * torch.arange(1, 6).log()[:, None])
-    basis = (ragged_sine_basis if from_zero else ragged_cosine_basis)(torch.tensor([5]), 5, torch.float64)
+    basis = BASES[name](torch.tensor([5]), 5, torch.float64)
     coefficients = torch.distributions.Normal(0.0, deviations).log_prob(basis @ ((x - loc) / scale))
     exact = rollout.evaluate("x", x).exact_log_prob(x, steps=200).log_prob
     torch.testing.assert_close(exact, (coefficients - scale.log()).sum((1, 2)).detach(), rtol=0, atol=2e-3)
@@ -392,7 +392,7 @@ def test_a_loss_is_an_energy_and_has_no_bound():
         (lambda: Diffusion(drop=0.1).build(Shape(2)), "no parents"),
         (lambda: FlowMatching(sampler="ancestral").build(Shape(2)), "'ddim' or 'heun'"),
         (lambda: Diffusion(denoiser=JOINT).build(Shape(2)), "denoiser=None"),
-        (lambda: joint("p(x_t | x_{<t}, z_{<=t}) p(z_t)", "q(z_t | x_{1:T})", COSINE), "cosine=False"),
+        (lambda: joint("p(x_t | x_{<t}, z_{<=t}) p(z_t)", "q(z_t | x_{1:T})", COSINE), "basis=None"),
         (lambda: Product([((0,), FlowMatching()), ((1,), Normal())]).build(Shape(2)), "no density"),
         (lambda: joint("p(x_t | z_t) p(z_t)", "q(z_t | x_{1:T})"), "needs a factor such as"),
         (lambda: joint("p(x_t | x_{<t}, z_t) p(z_t)", "q(z_t | x_{1:T})"), "needs a factor such as"),
