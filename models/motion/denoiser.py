@@ -25,7 +25,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from typing_extensions import override
 
 from ...data.batch import WHOLE
@@ -37,8 +37,10 @@ from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
 from ...motion import Heading, Skeleton
 from ...motion.data.protocols import Poses
+from ...motion.geometry.views import Bones
 from ...networks import Denoiser, Input, NetworkSpec, SelfAttention
 from ...networks.base import FixedLengthNetwork, perceptron
+from ...networks.denoising import ragged_sine_basis
 from ...networks.loop import memoize
 from ...options import Amount, Count, Extra, Layers, Positive, Range, Size
 from ...program.batch import AnyBatch
@@ -46,6 +48,9 @@ from ..baselines.moglow_paths import Offsets
 from ..method import fit_units
 from .futures import HISTORY, FutureMethod, FutureModel, LastState
 from .poses import table
+
+CURVE = 20
+"""Number of sine coefficients of a curve in the features."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,9 @@ class MotionDenoiser(FutureMethod):
         drop: probability that training hides h, for guidance.
         guidance: weight of h in forecasts; above 1 needs `drop`, and forecasts no longer follow the density.
         min_scale: lower bound of the scale of x without a denoiser, for standardised poses.
+        loss: "velocity" or "bound", as in `Diffusion`.
+        bones: whether each bone of a drawn pose is scaled to its mean length in the observed poses. The bound is that
+            of the draws without this step.
     """
 
     name = "denoiser"
@@ -82,12 +90,14 @@ class MotionDenoiser(FutureMethod):
     heads_count: Size = 4
     layers: Layers = 3
     coefficients: Extra = 20
-    schedule: Literal["learned", "cosine"] = "learned"
+    schedule: Literal["learned", "cosine"] = "cosine"
     sampler: Literal["heun", "ddim", "ancestral"] = "heun"
     sampler_steps: Count = 15
     drop: Annotated[float, Range(0, 1, below=True)] = 0.0
     guidance: Amount = 1.0
     min_scale: Positive = 0.001
+    loss: Literal["velocity", "bound"] = "velocity"
+    bones: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -117,6 +127,7 @@ class MotionDenoiser(FutureMethod):
             "p(x)": Diffusion(
                 denoiser=Denoiser(network, basis, self.coefficients or None),
                 schedule=self.schedule,
+                loss=self.loss,
                 steps=self.sampler_steps,
                 sampler=self.sampler,
                 drop=self.drop,
@@ -177,15 +188,21 @@ class MotionDenoiserModel(FutureModel):
                 f"horizon of {horizon}"
             )
         draws = super().forecast(data, most, samples, **options)
+        if self.method.bones and self.skeleton:
+            observed = data[HISTORY].unflatten(-1, (self.frames, -1))
+            draws[WHOLE] = Bones(self.skeleton).with_lengths(draws[WHOLE], observed)
         return {name: value[:, :, :horizon] for name, value in draws.items()}
 
 
 @dataclass(frozen=True)
 class MirroredPast:
-    """Features of x_t: the pose t steps before the last one, relative to it, and a code of the past.
+    """Features of x_t: the pose t steps before the last one, relative to it, a code of the past, and curves of it.
+
+    The curves are functions of t whose sine coefficients a perceptron reads from the code. The location of x, which is
+    linear in the features, can therefore be a motion.
 
     Args:
-        width: width of the code.
+        width: width of the code; there are half as many curves.
     """
 
     width: int
@@ -199,9 +216,12 @@ class MirroredPastNetwork(FixedLengthNetwork):
     """Network of `MirroredPast`."""
 
     def __init__(self, spec: MirroredPast, inputs: Sequence[Input], size: int) -> None:
-        super().__init__(inputs, True, size + spec.width)
+        curves = max(spec.width // 2, 1)
+        super().__init__(inputs, True, size + spec.width + curves)
         self.past = LastState(size, spec.width)
         self.code = perceptron((spec.width + size, spec.width), "gelu")
+        hidden = perceptron((spec.width, 2 * spec.width), "gelu")
+        self.curves = nn.Sequential(hidden, nn.Linear(2 * spec.width, CURVE * curves), nn.Unflatten(-1, (CURVE, -1)))
 
     @override
     def forward(self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None = None) -> Tensor:
@@ -210,4 +230,7 @@ class MirroredPastNetwork(FixedLengthNetwork):
         before = (poses[:, :-1] - last[:, None]).flip(1)[:, :length]
         before = torch.nn.functional.pad(before, (0, 0, 0, length - before.shape[1]))
         code = memoize(self, [parents[HISTORY]], lambda: self.code(torch.cat([self.past(parents[HISTORY]), last], -1)))
-        return torch.cat([before, code[:, None].expand(-1, length, -1)], -1)
+        valid = code.new_full(code.shape[:1], length) if lengths is None else lengths
+        basis = ragged_sine_basis(valid, length, code.dtype)[:, :CURVE]
+        curves = basis.mT @ self.curves(code)[:, : basis.shape[1]]
+        return torch.cat([before, code[:, None].expand(-1, length, -1), curves], -1)
