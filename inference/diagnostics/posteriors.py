@@ -291,6 +291,12 @@ class _Search:
             for name, site in nodes.items()
             if site["type"] == "sample" and not site["is_observed"] and not poutine.util.site_is_subsample(site)
         }
+        runs = {name: site["infer"]["run"] for name, site in nodes.items() if "run" in (site.get("infer") or {})}
+        if rough := [name for name, run in runs.items() if run.conditionals[name].head.density != "exact"]:
+            raise ValueError(
+                f"{', '.join(rough)} has a random bound or loss in place of a density, so its program has no energy "
+                "with a mode; use the draws of a guide"
+            )
         if not self.latents:
             raise ValueError(
                 "the program has no latents, because all its sites are observed; leave latents out of the batch"
