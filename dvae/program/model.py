@@ -287,14 +287,14 @@ class DynamicalVAE(nn.Module):
     @serialized
     @torch.inference_mode(False)
     def with_prior(self, distributions: Mapping[str, DistributionSpec]) -> DynamicalVAE:
-        """Return a copy whose latents have other distributions, which alone are trained: the second of two stages.
+        """Return a copy with new distributions of latents and all other parameters frozen, for a second stage.
 
-        Fitting the copy trains these distributions on draws of the guide. With a `Diffusion`, the copy is a latent
-        diffusion model (Rombach et al., 2022, arXiv 2112.10752). All other parameters have `requires_grad` False.
+        Fitting the copy trains the new distributions on draws of the guide. With a `Diffusion`, the copy is a latent
+        diffusion model (Rombach et al., 2022, arXiv 2112.10752). The frozen parameters have `requires_grad` False.
 
         Args:
-            distributions: dictionary from generative factor of a latent, such as "p(w)", to its new distribution. A
-                network of such a factor has the same description as before and new weights.
+            distributions: dictionary from generative factor of a latent, such as "p(w)", to its new distribution. If
+                the factor has a network, it has the same description as before and new weights.
 
         Raises:
             ValueError: if a key is not a factor of a latent, the guide is the prior, or a distribution does not fit.

@@ -58,7 +58,8 @@ def predictive_bound(
         ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no step is
             left to observe or to predict.
     """
-    if not _has_ode(model):
+    is_diffusion = _is_one_diffusion(model)
+    if not is_diffusion:
         require_densities(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
         raise ValueError(
@@ -103,7 +104,7 @@ def predictive_bound(
             future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
             return total(future) + total(log_densities(past_guide)) - total(log_densities(proposed))
 
-        if _has_ode(model):
+        if is_diffusion:
             density = _ode_density(model, data, observed)
             result = IWAEBound(density, torch.full_like(density, math.nan), particles)
         else:
@@ -111,12 +112,11 @@ def predictive_bound(
         return replace(result, bound=result.bound + log_det[:, observed:].sum(1).to(result.bound))
 
 
-def _has_ode(model: DynamicalVAE) -> bool:
-    """Return whether the model is one factor whose draws and density are a probability-flow ODE's."""
-    factors = [*model.generator.values()]
-    head = factors[0].head
-    is_diffusion = len(factors) == 1 and isinstance(head, DiffusionModule)
-    return is_diffusion and head.spec.guidance == 1 and factors[0].factor.local and factors[0].offset is None
+def _is_one_diffusion(model: DynamicalVAE) -> bool:
+    """Return whether the model is one local factor with a `Diffusion` whose draws follow its density."""
+    first, *others = model.generator.values()
+    is_alone = not others and first.factor.local and first.offset is None
+    return is_alone and isinstance(first.head, DiffusionModule) and first.head.spec.guidance == 1
 
 
 def _ode_density(model: DynamicalVAE, data: Batch, observed: int) -> Tensor:

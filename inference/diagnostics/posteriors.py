@@ -221,8 +221,8 @@ def posterior(
     descent = descent or Descent()
     size, at_once = len(_some(batch)), max(1, chunk // descent.starts)
     device = _some(batch).device
-    math = sdpa_kernel(SDPBackend.MATH)  # the only kernel of attention with second derivatives
-    with seeded(seed, device), pyro.validation_enabled(False), math, progress_bar(progress) as bar:
+    attention = sdpa_kernel(SDPBackend.MATH)  # the only kernel of attention with second derivatives
+    with seeded(seed, device), pyro.validation_enabled(False), attention, progress_bar(progress) as bar:
         chunks = [rows(batch, slice(first, first + at_once)) for first in range(0, size, at_once)]
         task = bar.add_task("searching for modes", total=len(chunks) * (descent.steps + descent.newton + 1))
         parts = [_Search(program, chunk, guide, descent, renew, partial(bar.advance, task)).run() for chunk in chunks]

@@ -65,6 +65,11 @@ def test_draws_and_forecasts_follow_the_new_prior_and_its_bound_is_labelled(fitt
     assert model.sample(5, length=6)["w"].min() > 30
     z = second.forecast(two_levels(3), 2, samples=4)["z"]
     assert z[:, :, :6].abs().max() < 30 < z[:, :, 6:].min()
+    networks, view = {"default": Recurrent(8)}, dvae.data.views.Past("h", frames=4)
+    pair, sizes = ("p(z_{1:T} | h) p(x_t | z_t)", "q(z_t | x_{1:T}, h)"), {"z": 1, "x": 1, "h": 4}
+    joint = Diffusion(denoiser=Denoiser(Recurrent(8)), steps=2)
+    third = dvae.DynamicalVAE(*pair, sizes, networks, view=view).with_prior({"p(z)": joint})
+    assert third.forecast(two_levels(3)[:, :4], 2, samples=4)["x"].shape == (4, 3, 2, 1)
     assert model.requires_grad_().generator["x"].head.out.weight.requires_grad
 
 
