@@ -363,8 +363,8 @@ def bound_notes(label: str, model: DynamicalVAE) -> Iterator[str]:
     """Yield a note for tables if a variable of the model has a stochastic bound in place of a density."""
     if model.bounded:
         yield (
-            f"bounds of {label}: {', '.join(model.bounded)} has a stochastic lower bound in place of a log density, so "
-            "they are mean ELBOs, without importance weights and k-hat"
+            f"bounds of {label}: {', '.join(model.bounded)} has a stochastic lower bound in place of a log density, "
+            "without importance weights (K = 1) and k-hat"
         )
 
 
@@ -449,7 +449,7 @@ def iwae_bound(
         size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
         if not model.latents:
             evidence = _log_weights(model, data, options)
-            return IWAEBound(evidence, torch.zeros_like(evidence), particles)
+            return IWAEBound(evidence, torch.full_like(evidence, math.nan if model.bounded else 0.0), particles)
         groups = Groups.of(data.group) if model.grouped and data.group is not None else None
         weights = partial(_repeated_weights, model, data, options)
         return importance_mean(weights, size, particles, chunk, groups)

@@ -19,7 +19,7 @@ from ...program.batch import repeat
 from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence as SequenceDistribution
 from ..evaluation.evaluation_windows import on_device_of, refuse_non_finite
-from .elbo import IWAEBound, SequenceELBO, iwae_bound, site_log_prob, sites_of
+from .elbo import SequenceELBO, iwae_bound, site_log_prob, sites_of
 from .particles import fivo_bound
 
 _GUIDE_DRAWS = 8  # averaged for posterior means; the variance of the remaining noise is subtracted
@@ -57,7 +57,7 @@ def bounds(
     for part in parts:
         piece = on_device_of(model, batch.rows(part))
         terms = SequenceELBO().terms(model, piece)
-        draws = [_weighted_bound(model, piece, particles) for _ in range(estimates)]
+        draws = [iwae_bound(model, piece, particles=particles) for _ in range(estimates)]
         values = torch.stack([draw.bound for draw in draws])
         scores = {"ELBO": terms.bound, "IWAE bound": values.mean(0)}
         for bound in scores.values():
@@ -79,14 +79,6 @@ def bounds(
         "estimates": weighted.numpy(),
         "steps": length.numpy(),
     }
-
-
-def _weighted_bound(model: DynamicalVAE, batch: Batch, particles: int) -> IWAEBound:
-    """Return the IWAE bound; the mean of as many ELBOs, without k-hat, if importance weights are not available."""
-    if not model.bounded:
-        return iwae_bound(model, batch, particles=particles)
-    bound = SequenceELBO(particles).terms(model, batch).bound
-    return IWAEBound(bound, torch.full_like(bound, math.nan), particles)
 
 
 def filtered(
