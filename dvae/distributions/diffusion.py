@@ -67,6 +67,8 @@ class Diffusion:
         schedule: "learned" is linear in the log signal-to-noise ratio, with learned ends; "cosine" is linear in the
             angle a, with fixed ends.
         log_snr: lowest and highest log signal-to-noise ratio, the initial ones if they are learned.
+        shift: number added to the log signal-to-noise ratio of the cosine schedule between its ends; above 0, more times
+            have little noise (Hoogeboom et al., 2023, arXiv 2301.11093).
         loss: what training minimises. "bound": minus the bound. "velocity": the squared error of v at the times of the
             schedule, minus the log density of N(m, s^2). It has more weight at high noise levels, so that draws are
             better and the bound is lower. Training then reports it as an energy; evaluation has the bound.
@@ -84,6 +86,7 @@ class Diffusion:
     denoiser: DenoiserSpec | None = None
     schedule: Literal["learned", "cosine"] = "learned"
     log_snr: tuple[float, float] = (-10.0, 10.0)
+    shift: float = 0.0
     loss: Literal["bound", "velocity"] = "bound"
     steps: int = 20
     sampler: Literal["ancestral", "ddim", "heun"] = "heun"
@@ -116,6 +119,8 @@ class Diffusion:
                 "a Diffusion has the loss 'bound', or 'velocity' with schedule='cosine', got "
                 f"loss={self.loss!r} and schedule={self.schedule!r}"
             )
+        if self.shift and self.schedule == "learned":
+            raise ValueError(f"`shift` is {self.shift}, but a learned schedule has none; use schedule='cosine'")
         if not -MAX_LOG_SNR <= self.log_snr[0] < self.log_snr[1] <= MAX_LOG_SNR:
             raise ValueError(
                 f"`log_snr` must be increasing and between -{MAX_LOG_SNR} and {MAX_LOG_SNR}, got {self.log_snr}"
@@ -358,17 +363,24 @@ class DiffusionModule(DenoisingModule):
 
     @override
     def angle(self, t: Tensor) -> Tensor:
-        low, high = self.noise_range
         if self.spec.schedule == "learned":
-            return (torch.lerp(low, high, t) / 2).exp().atan()
-        return torch.lerp((low / 2).exp().atan(), (high / 2).exp().atan(), t)
+            return (torch.lerp(*self.noise_range, t) / 2).exp().atan()
+        low, high = self._shifted_range()
+        return (math.exp(-self.spec.shift / 2) * torch.lerp(low, high, t).tan()).atan()
 
     def weight(self, t: Tensor) -> Tensor:
         """Return w = cot(a) da / dt at times t (...)."""
-        low, high = self.noise_range
         if self.spec.schedule == "learned":
+            low, high = self.noise_range
             return torch.sigmoid(-torch.lerp(low, high, t)) * (high - low) / 2
-        return ((high / 2).exp().atan() - (low / 2).exp().atan()) / self.angle(t).tan()
+        low, high = self._shifted_range()
+        double = torch.sin(2 * torch.lerp(low, high, t))  # of the angle without the shift
+        return 2 * (high - low) * self.angle(t).cos().square() / double
+
+    def _shifted_range(self) -> tuple[Tensor, Tensor]:
+        """Return the lowest and highest angle of the cosine schedule without its shift."""
+        low, high = ((end + self.spec.shift) / 2 for end in self.noise_range)
+        return low.exp().atan(), high.exp().atan()
 
     @property
     def density(self) -> str:  # type: ignore[override]
@@ -442,6 +454,11 @@ class DenoisingDistribution(TorchDistribution):
     def __init__(self, module: DenoisingModule, parameters: Parameters):
         self.module, self.parameters = module, parameters
         super().__init__(parameters[0].shape[:-1], parameters[0].shape[-1:], validate_args=False)
+
+    def _shifted_range(self) -> tuple[Tensor, Tensor]:
+        """Return the lowest and highest angle of the cosine schedule without its shift."""
+        low, high = ((end + self.spec.shift) / 2 for end in self.noise_range)
+        return low.exp().atan(), high.exp().atan()
 
     @property
     def density(self) -> str:

@@ -42,9 +42,9 @@ def build(spec, denoiser=optimal):
     return module, parameters
 
 
-@pytest.mark.parametrize("schedule", ["learned", "cosine"])
-def test_the_bound_of_normal_data_is_tight(schedule):
-    module, parameters = build(Diffusion(schedule=schedule))
+@pytest.mark.parametrize(("schedule", "shift"), [("learned", 0.0), ("cosine", 0.0), ("cosine", 1.5)])
+def test_the_bound_of_normal_data_is_tight(schedule, shift):
+    module, parameters = build(Diffusion(schedule=schedule, shift=shift))
     x = DATA.sample((500_000,))
     gap = (DATA.log_prob(x) - module.distribution(parameters(len(x))).log_prob(x)).detach() / 2
     error = gap.std() / math.sqrt(len(x))
@@ -452,6 +452,7 @@ def test_a_loss_is_an_energy_and_has_no_bound():
     [
         (lambda: Diffusion(steps=0).build(Shape(2)), "`steps` of at least 1"),
         (lambda: Diffusion(schedule="linear").build(Shape(2)), "schedule"),
+        (lambda: Diffusion(shift=1.0).build(Shape(2)), "a learned schedule has none"),
         (lambda: Diffusion(loss="velocity").build(Shape(2)), "'velocity' with schedule='cosine'"),
         (lambda: Diffusion(log_snr=(3.0, 1.0)).build(Shape(2)), "increasing"),
         (lambda: Diffusion(guidance=2.0).build(Shape(2, 1)), "set `drop` above 0"),
