@@ -67,8 +67,8 @@ class Diffusion:
         schedule: "learned" is linear in the log signal-to-noise ratio, with learned ends; "cosine" is linear in the
             angle a, with fixed ends.
         log_snr: lowest and highest log signal-to-noise ratio, the initial ones if they are learned.
-        shift: number added to the log signal-to-noise ratio of the cosine schedule between its ends; above 0, more times
-            have little noise (Hoogeboom et al., 2023, arXiv 2301.11093).
+        shift: number added to the log signal-to-noise ratio of the cosine schedule between its ends; above 0, more
+            times have little noise (Hoogeboom et al., 2023, arXiv 2301.11093).
         loss: what training minimises. "bound": minus the bound. "velocity": the squared error of v at the times of the
             schedule, minus the log density of N(m, s^2). It has more weight at high noise levels, so that draws are
             better and the bound is lower. Training then reports it as an energy; evaluation has the bound.
