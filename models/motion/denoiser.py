@@ -63,13 +63,14 @@ class MotionDenoiser(FutureMethod):
         width: width of the transformer and of the code of h.
         heads_count, layers: attention heads and layers of the transformer.
         coefficients: number of sine coefficients that the transformer reads; 0 to denoise frames instead.
-        schedule: "learned" or "cosine", as in `Diffusion`.
         sampler: "heun", "ddim" or "ancestral".
         sampler_steps: number of steps of the sampler.
         drop: probability that training hides h, for guidance.
         guidance: weight of h in forecasts; above 1 needs `drop`, and forecasts no longer follow the density.
         min_scale: lower bound of the scale of x without a denoiser, for standardised poses.
-        loss: "velocity" or "bound", as in `Diffusion`.
+        loss: "velocity", or "bound" with a learned schedule, as in `Diffusion`.
+        shift: number added to the log signal-to-noise ratio of the cosine schedule of "velocity".
+        code_dropout: probability that training sets an entry of the code of h to 0.
         bones: whether each bone of a drawn pose is scaled to its mean length in the observed poses. The bound is that
             of the draws without this step.
     """
@@ -82,7 +83,7 @@ class MotionDenoiser(FutureMethod):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = table(
         "heading", {"human36m": (False,), "humaneva": (False,), "": (True,)}
     )
-    trainings: ClassVar[Mapping[str, Training]] = {"": Training(4000, 64, 1e-3, 0.5, gradient_clip=1.0)}
+    trainings: ClassVar[Mapping[str, Training]] = {"": Training(2000, 64, 3e-3, 0.5, gradient_clip=1.0)}
 
     latent: None = None
     beta: None = None
@@ -90,13 +91,14 @@ class MotionDenoiser(FutureMethod):
     heads_count: Size = 4
     layers: Layers = 3
     coefficients: Extra = 20
-    schedule: Literal["learned", "cosine"] = "cosine"
     sampler: Literal["heun", "ddim", "ancestral"] = "heun"
     sampler_steps: Count = 15
     drop: Annotated[float, Range(0, 1, below=True)] = 0.0
     guidance: Amount = 1.0
     min_scale: Positive = 0.001
     loss: Literal["velocity", "bound"] = "velocity"
+    shift: float = 2.0
+    code_dropout: Annotated[float, Range(0, 1, below=True)] = 0.1
     bones: bool = True
 
     def __post_init__(self) -> None:
@@ -117,7 +119,7 @@ class MotionDenoiser(FutureMethod):
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
-        return {"p(x)": MirroredPast(self.width)}
+        return {"p(x)": MirroredPast(self.width, self.code_dropout)}
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:
@@ -126,7 +128,8 @@ class MotionDenoiser(FutureMethod):
         return {
             "p(x)": Diffusion(
                 denoiser=Denoiser(network, basis, self.coefficients or None),
-                schedule=self.schedule,
+                schedule="cosine" if self.loss == "velocity" else "learned",
+                shift=self.shift if self.loss == "velocity" else 0.0,
                 loss=self.loss,
                 steps=self.sampler_steps,
                 sampler=self.sampler,
@@ -169,6 +172,7 @@ class MotionDenoiser(FutureMethod):
 class MotionDenoiserModel(FutureModel):
     """A diffusion model of as many future frames as in training; shorter forecasts are the first frames of these."""
 
+    method: MotionDenoiser
     horizon: int | None = None
     """T, number of future frames; None if unknown."""
 
@@ -203,9 +207,11 @@ class MirroredPast:
 
     Args:
         width: width of the code; there are half as many curves.
+        dropout: probability that training sets an entry of the code to 0.
     """
 
     width: int
+    dropout: float = 0.0
 
     def build(self, inputs: Sequence[Input], local: bool, size: int) -> MirroredPastNetwork:
         """Return the network for a child of dimension `size`, local or static, with the parents `inputs`."""
@@ -219,7 +225,7 @@ class MirroredPastNetwork(FixedLengthNetwork):
         curves = max(spec.width // 2, 1)
         super().__init__(inputs, True, size + spec.width + curves)
         self.past = LastState(size, spec.width)
-        self.code = perceptron((spec.width + size, spec.width), "gelu")
+        self.code = nn.Sequential(perceptron((spec.width + size, spec.width), "gelu"), nn.Dropout(spec.dropout))
         hidden = perceptron((spec.width, 2 * spec.width), "gelu")
         self.curves = nn.Sequential(hidden, nn.Linear(2 * spec.width, CURVE * curves), nn.Unflatten(-1, (CURVE, -1)))
 
