@@ -10,10 +10,13 @@ completes one sequence of past and future, omits high coefficients, and sets a c
 (Curreli et al., 2025, arXiv 2501.06035) has noise with the covariance of the joints, in the latents of an autoencoder.
 There are no layers or weights of either paper here. Ours:
 
-* The likelihood: a bound with a learned schedule and Gaussian high coefficients, so that x has a density.
+* The location and scale of x are trained by the normal density: the location is a forecast from h, and the denoiser
+  draws deviations from it. A shifted schedule has more times with little noise. High coefficients are normal, so that x
+  has a density.
 * Each coefficient is denoised in units of its own learned scale (`networks.Denoiser`).
 * Sines in place of cosines (DST-VII), because x continues from 0.
-* h enters by its code, and by the pose t steps before the last one as a feature of x_t.
+* h enters by its code, by curves with coefficients from the code, and by the pose t steps before the last one.
+* Drawn bones have their observed lengths.
 * Windows are rotated so that the last observed pose faces one way.
 """
 
