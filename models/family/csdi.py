@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -35,6 +35,7 @@ from ...distributions import Diffusion, DistributionSpec, Product
 from ...distributions.base import Shape, is_real
 from ...factorization.notation import Factorization
 from ...factorization.relations import ALL
+from ...inference.training.options import Training
 from ...inference.training.recipe import Recipe
 from ...networks import Denoiser, Input, NetworkSpec, SelfAttention
 from ...networks.base import FixedLengthNetwork, aligned
@@ -68,6 +69,11 @@ class CSDI(LikelihoodMethod):
     generative = "p(x_{1:T} | g_{1:T})"
     inference = ""
 
+    trainings: ClassVar[Mapping[str, Training]] = {
+        **LikelihoodMethod.trainings,
+        "table": Training(1000, 64, 3e-3, decay=0.3, validate_every=100, select="forecast", patience=3),
+    }
+
     latent: None = None
     emission: None = None
     scheduled_sampling: None = None
@@ -77,7 +83,7 @@ class CSDI(LikelihoodMethod):
     heads_count: Size = 4
     layers: Layers = 2
     schedule: Literal["learned", "cosine"] = "learned"
-    sampler_steps: Count = 10
+    sampler_steps: Count = 15
 
     def __post_init__(self) -> None:
         super().__post_init__()
