@@ -490,7 +490,7 @@ class Given(View):
     @property
     def measured(self) -> str:  # type: ignore[override]
         """Quantity that densities refer to: all entries if none is given."""
-        return "" if self.observed is None else f"the steps after the first {self.observed}, given these"
+        return "" if self.observed is None else f"steps after the first {self.observed} given the first {self.observed}"
 
     @override
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:

@@ -8,8 +8,8 @@ are targets; with a horizon, half of the windows are given the observed steps on
 arXiv 2107.03502: sections 3.2 (conditional diffusion), 4.2 (training) and 4.3 (choice of targets). Ours:
 
 * The likelihood: a bound of the density of the targets, with a learned schedule, in place of the weighted loss.
-* Location and scale of the diffusion are linear functions of g, and of g interpolated in time, which also enter the
-  denoiser. The paper's denoiser starts from noise of variance 1.
+* Location and scale of the diffusion are linear functions of g interpolated in time, and of a code of g by a second
+  transformer; both also enter the denoiser. The paper's diffusion starts from noise of variance 1.
 * Attention over time only. A frame of all columns is one token, so the layers between frames mix the columns. The paper
   has a token for each column and step, and also attention over columns.
 * Level and scale of each series, estimated from its given entries (`units="series"`).
@@ -45,6 +45,8 @@ from ...program.model import DynamicalVAE
 from ..method import LikelihoodMethod
 
 CONTEXT = "g"
+LOGARITHMS = ("positive", "log-normal")
+"""Families of positive columns, which become real in the units "logs" and "series"."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,15 @@ class CSDI(LikelihoodMethod):
     Columns are real numbers, or positive ones as logarithms. Without covariates, any sequences of numbers are valid.
 
     Args:
-        latent, emission, scheduled_sampling: always None; the method has no latents, and its distribution is fixed.
+        latent: always None; the method has no latents.
+        emission: always None; x has a `Diffusion`.
         residual: always 0.
         units: "columns", "logs" or "series", as in `LikelihoodMethod`. None: "series" if the training windows prefer
             units of the sequence, "logs" if a column is positive, else "columns".
-        width: width of the transformer.
-        heads_count, layers: attention heads and layers of the transformer.
+        width: width of the transformers.
+        heads_count: number of attention heads.
+        layers: number of layers of each transformer.
+        scheduled_sampling: always None.
         schedule: "learned" or "cosine", as in `Diffusion`.
         sampler_steps: number of steps of the sampler, with two evaluations each.
     """
@@ -71,7 +76,7 @@ class CSDI(LikelihoodMethod):
 
     trainings: ClassVar[Mapping[str, Training]] = {
         **LikelihoodMethod.trainings,
-        "table": Training(1000, 64, 3e-3, decay=0.3, validate_every=100, select="forecast", patience=3),
+        "table": Training(1000, 64, 3e-3, decay=0.3, validate_every=200, select="forecast", patience=2),
     }
 
     latent: None = None
@@ -100,8 +105,8 @@ class CSDI(LikelihoodMethod):
             return self
         if getattr(schema, "preferred", "columns") != "columns":
             return replace(self, units="series")
-        is_positive = schema.emission is not None and not is_real(_support(schema.emission, schema.size(WHOLE)))
-        return replace(self, units="logs" if is_positive else "columns")
+        families = [column.family for column in schema.columns.targets] if hasattr(schema, "columns") else []
+        return replace(self, units="logs" if {*families} & {*LOGARITHMS} else "columns")
 
     @override
     def networks(self) -> Mapping[str, NetworkSpec]:
@@ -197,10 +202,6 @@ def _views(view: View) -> list[View]:
     return [GivenUnits(v.priors, 0, v.observed) if isinstance(v, SeriesUnits) else v for v in views]
 
 
-def _support(emission: DistributionSpec, size: int) -> Any:
-    return emission.build(Shape(size, 1)).support
-
-
 def _check_columns(schema: Any) -> None:
     """Check that all columns are real, and no covariate contains targets.
 
@@ -211,7 +212,7 @@ def _check_columns(schema: Any) -> None:
         return
     single = [(range(schema.size(WHOLE)), schema.emission)]
     for places, part in schema.emission.parts if isinstance(schema.emission, Product) else single:
-        if not is_real(_support(part, len(places))):
+        if not is_real(part.build(Shape(len(places), 1)).support):
             columns = [column for column in schema.columns.targets for _ in column.coordinates]
             column = columns[places[0]]
             raise SchemaError(
@@ -227,7 +228,7 @@ def _check_columns(schema: Any) -> None:
 
 @dataclass(frozen=True)
 class GivenFeatures:
-    """Features of the given entries: they interpolated in time, and a code of all given entries by a network.
+    """Features of the given entries: their interpolation in time, and a code of them by a network.
 
     Args:
         network: network that reads the interpolated entries, their indicators and the other parents.

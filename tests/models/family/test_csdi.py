@@ -212,7 +212,7 @@ def test_it_fits_forecasts_and_imputes_a_table(data, tmp_path, units):
     assert (imputed.draws[:, imputed.missing].std(0) > 0).all()
     scores = dvae.evaluate(model, windows, samples=3, progress=False)
     assert np.isfinite(scores["model"]["CRPS"].mean)
-    assert any("densities of the steps after the first 6, given these" in note for note in scores.notes)
+    assert any("densities of steps after the first 6 given the first 6" in note for note in scores.notes)
     other = dvae.method("autoregressive", width=4).build(data.schema)
     with pytest.raises(ValueError, match="bounds are comparable only as densities of the same data"):
         dvae.compare({"csdi": model, "autoregressive": other}, windows, progress=False)
@@ -262,6 +262,7 @@ def test_units_are_chosen_for_the_data(data):
         ({}, {"flow": {"family": "count"}}, "column 'flow' has the family 'count'; give it the family real"),
         ({}, {"temp": {"family": "category", "classes": ("a", "b")}}, "column 'temp' has the family 'category'"),
         ({}, {"temp": {"family": "binary"}}, "column 'temp' has the family 'binary'"),
+        ({}, {"flow": {"family": "binary"}, "temp": {"family": "binary"}}, "column 'flow' has the family 'binary'"),
         ({"units": "columns"}, {}, "column 'flow' has the family 'log-normal'"),
         ({"units": "changes"}, {}, "known: columns, logs, series"),
         ({"residual": 0.5}, {}, "residual"),
