@@ -268,7 +268,7 @@ def _impute_draws(model: Any, batch: AnyBatch, samples: int, chunk: int, particl
 
 
 def _impute_given(model: Any, batch: Batch, samples: int, chunk: int, drawing: bool) -> dict[str, Tensor]:
-    """Return draws or means of x, of which all observed entries are given as context (`views.Given`)."""
+    """Return draws or means of x given all its observed entries (`views.Given`)."""
     name, mask = model.observed[0], torch.as_tensor(batch.mask())
     read = model.read(batch | {GIVEN: mask})
     missing = ~mask.to(read[name].device)

@@ -76,7 +76,7 @@ class CSDI(LikelihoodMethod):
 
     trainings: ClassVar[Mapping[str, Training]] = {
         **LikelihoodMethod.trainings,
-        "table": Training(1000, 64, 3e-3, decay=0.3, validate_every=200, select="forecast", patience=2),
+        "table": Training(1000, 64, 3e-3, decay=0.3, validate_every=100, select="forecast", patience=3),
     }
 
     latent: None = None

@@ -1,4 +1,4 @@
-"""CSDI: what the model reads, the density of the targets, imputation of normal data, and tables."""
+"""CSDI: inputs of the model, density of the targets, imputation of normal data, and tables."""
 
 import math
 from dataclasses import replace
@@ -167,7 +167,7 @@ def test_random_targets_are_futures_steps_or_entries():
 
 
 def test_draws_have_the_conditional_mean_and_variance_of_normal_data():
-    """AR(1) with coefficient 0.8 and unit variance, of which half of the entries are given, or the first two."""
+    """AR(1) with coefficient 0.8 and unit variance; half of the entries or the first two are given."""
     length, steps = 5, torch.arange(5)
     covariance = 0.8 ** (steps[:, None] - steps).abs().double()
     torch.manual_seed(0)
