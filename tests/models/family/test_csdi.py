@@ -218,6 +218,22 @@ def test_it_fits_forecasts_and_imputes_a_table(data, tmp_path, units):
         dvae.compare({"csdi": model, "autoregressive": other}, windows, progress=False)
 
 
+@pytest.mark.parametrize("units", ["logs", "series"])
+def test_bounds_of_whole_sequences_are_of_all_entries_and_comparable(units):
+    """Sequences of different lengths."""
+    table = frame()
+    data = PanelData.of(table[(table.site != "s3") | (table.groupby("site").cumcount() < 10)], COLUMNS, Cut())
+    options = {"steps": 2, "batch_size": 4, "validate_every": 2, "progress": False}
+    models = {
+        "csdi": dvae.fit(small(units=units), data, **options).model,
+        "autoregressive": dvae.fit(dvae.method("autoregressive", width=4), data, **options).model,
+    }
+    imputed = data.whole().impute(models["csdi"], samples=3)
+    assert (imputed.draws[:, imputed.missing].std(0) > 0).all()
+    result = dvae.compare(models, data.windows("test"), particles=1, contrasts=0, progress=False)
+    assert any("stochastic lower bound" in note for note in result.rows["csdi"].notes)
+
+
 def test_every_window_of_a_long_sequence_is_filled():
     model = small().build(torch.randn(4, 6, 2)).eval()
     for length in (6, 7, 11, 23):
