@@ -64,15 +64,17 @@ class GaussianFilter:
         self.context = {n: Rows([None] * known.length) for n in model.context if live and model.reader.local[n]}
         self.position = -1
 
-    def start(self) -> None:
-        """Compute the moments of the static latents."""
+    def start(self) -> Tensor:
+        """Compute the moments of the static latents; return the log evidence 0 (B,) before any data."""
         batch = self.known.batch
         self.log_weights = torch.zeros(1, batch, dtype=torch.float64, device=like(self.model).device)
+        self.effective = torch.ones_like(self.log_weights[0])
         self.mean = self.log_weights.new_zeros(batch, 0)
         self.covariance = self.log_weights.new_zeros(batch, 0, 0)
         for name in self.statics:
             self._extend(name, noisy=True)
         self.static_size = self.mean.shape[1]
+        return self.log_weights[0]
 
     def fork(self) -> GaussianFilter:
         """Return a copy whose steps do not change this filter."""
@@ -107,10 +109,11 @@ class GaussianFilter:
             result[name] = self.model.generator[name], moments, torch.zeros_like(self.log_weights)
         return result
 
-    def weigh(self) -> None:
-        """Condition on the data of the step, and add their log density to `log_weights`."""
+    def weigh(self) -> Tensor:
+        """Condition on the data of the step, and return their log density (B,)."""
         if not self.live:
             self.run, self.t = self.known, self.position
+        total = self.log_weights[0]
         for name in self.model.observed:
             part, mask = self._part(name, self.position), self.run.mask(name)
             value = self.run.values[name][:, self.t].double()
@@ -122,7 +125,7 @@ class GaussianFilter:
             white = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
             gain = torch.cholesky_solve((self.covariance[:, :, part] * observed[:, None]).mT, root).mT
             log_density = -0.5 * white.square().sum(1) - root.diagonal(dim1=1, dim2=2).log().sum(1)
-            self.log_weights = self.log_weights + log_density - 0.5 * math.log(2 * math.pi) * observed.sum(1)
+            total = total + log_density - 0.5 * math.log(2 * math.pi) * observed.sum(1)
             self.mean = self.mean + (gain @ residual[..., None])[..., 0]
             covariance = self.covariance - gain @ spread @ gain.mT
             # the model reads the value where it was observed, and its own mean elsewhere
@@ -130,6 +133,7 @@ class GaussianFilter:
             uncertain = torch.ones_like(self.mean)
             uncertain[:, part] = 1 - observed
             self.covariance = (covariance + covariance.mT) / 2 * uncertain[:, :, None] * uncertain[:, None]
+        return total
 
     def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
         """Return mean and variance (B, D) of each latent `lag` steps ago, given the data so far."""

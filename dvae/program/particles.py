@@ -107,10 +107,10 @@ class Particles:
 
     # The steps ----------------------------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Draw the static latents that precede the steps, and evaluate what is known about all steps."""
+    def start(self) -> Tensor:
+        """Draw the static latents that precede the steps, evaluate what is known about all steps, and `normalise`."""
         model = self.model
-        self.log_weights = self._draw_statics(late=False).view(self.particles, -1)
+        self.log_weights = self._draw_statics(late=False).view(self.particles, -1) - math.log(self.particles)
         with memoizing():
             self.guide = {
                 name: self._stepwise(model.encoder[name], self.known.values)
@@ -123,6 +123,17 @@ class Particles:
         self.past_states = self._slots(["joint", "logs"] if self.lag and model.summed else [])
         self.adopts = not self.guide and not self.read_now & {*self.data_names}
         """Whether predictions and weights need the same draws and network evaluations, as in a bootstrap filter."""
+        return self.normalise()
+
+    def normalise(self) -> Tensor:
+        """Divide the weights by their sum, and return its log (B,): the log evidence of the data since the last call.
+
+        If all weights of a sequence are 0, they become equal.
+        """
+        total = self.log_weights.logsumexp(0)
+        self.log_weights = torch.where(total > -math.inf, self.log_weights - total, -math.log(self.particles))
+        self.effective = effective_size(self.log_weights)
+        return total
 
     def begin(self, resample_below: float, valid: Tensor | None = None) -> Tensor:
         """Move to the next step: resample, and draw the noise of the step; return where particles were resampled.
@@ -131,13 +142,13 @@ class Particles:
             resample_below: share of the particles; the effective sample size below which they are resampled.
             valid: (B,), False for sequences that have ended; None if none has.
         """
-        low = effective_size(self.log_weights) < resample_below * self.particles
+        low = self.effective < resample_below * self.particles
         low = low if valid is None else low & valid
         if self.position < 0 and not self.statics:
             low = torch.zeros_like(low)
         if low.any():
             self._select(ancestors(self.log_weights, low))
-            self.log_weights = self.log_weights.masked_fill(low, 0)
+            self.log_weights = self.log_weights.masked_fill(low, -math.log(self.particles))
         if self.position == self.known.length - 1:
             slide([self.paths, self.data, self.masks, self.guide, self.prior, self.past_states])
         self.position = min(self.position + 1, self.known.length - 1)
@@ -176,8 +187,8 @@ class Particles:
             mask = run.mask(name)
             masks[self.position] = None if mask is None else pick(mask[:, t], self.sequence)
 
-    def weigh(self) -> None:
-        """Draw the latents at the step from their proposals, and multiply the weights by those of the step."""
+    def weigh(self) -> Tensor:
+        """Draw the latents at the step from their proposals, multiply the weights by those of the step, and `normalise`."""
         t, total = self.position, self.log_weights.new_zeros(len(self.sequence))
         reads = {**self.paths, **self.data}  # the guide reads data as given, and the model its means where they miss
         for name, each in self.guide.items():
@@ -214,6 +225,7 @@ class Particles:
         if self.shape[1] > 1:  # forget the oldest step of the window
             windows = windows.flatten(-2).unflatten(-1, (self.shape[2], -1)).movedim(-2, -1)
         self.states = windows.logsumexp(-1)
+        return self.normalise()
 
     def predict(self) -> dict[str, tuple[Conditional, Parameters, Tensor]]:
         """Return the distribution of each local data variable at the step, before its data are used.
@@ -257,7 +269,7 @@ class Particles:
 
     def _component_weights(self, each: Stepwise, joint: Tensor, t: int) -> Tensor:
         """Return normalised log weights (C, B) of the components of a mixture."""
-        weights = self.log_weights.log_softmax(0)
+        weights = self.log_weights
         if each.places is None:
             return weights
         place = each.place(t).expand(len(joint), -1)
@@ -274,20 +286,15 @@ class Particles:
             The log of the estimated evidence (B,), the effective sample sizes (T, B), NaN at padding, and the number of
             resamplings (B,).
         """
-        self.start()
-        bound, effective, length = self.log_weights.new_zeros(self.known.batch), [], self.known.length
+        bound, effective, length = self.start(), [], self.known.length
         resamplings = torch.zeros_like(bound, dtype=torch.long)
         valid = None if self.known.lengths is None else valid_steps(self.known.lengths, length).t()
         for t in range(length):
-            before = log_mean(self.log_weights)
-            low = self.begin(resample_below, None if valid is None else valid[t])
-            bound = torch.where(low, bound + before, bound)
-            resamplings += low
-            self.weigh()
-            size = effective_size(self.log_weights)
-            effective.append(size if valid is None else size.masked_fill(~valid[t], math.nan))
-        self.log_weights = self.log_weights + self._draw_statics(late=True).view_as(self.log_weights)
-        return bound + log_mean(self.log_weights), torch.stack(effective), resamplings
+            resamplings += self.begin(resample_below, None if valid is None else valid[t])
+            bound = bound + self.weigh()
+            effective.append(self.effective if valid is None else self.effective.masked_fill(~valid[t], math.nan))
+        late = self._draw_statics(late=True).view_as(self.log_weights)
+        return bound + (self.log_weights + late).logsumexp(0), torch.stack(effective), resamplings
 
     @property
     def drawn(self) -> dict[str, Tensor]:
@@ -303,9 +310,10 @@ class Particles:
 
     def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
         """Return moments (B, D) of each latent, and of states their probabilities, `lag` steps ago given all data."""
-        values = {name: value.unflatten(0, self.log_weights.shape) for name, value in self.latents(lag).items()}
+        weights, values = self.log_weights.exp()[..., None], self.latents(lag)
         moments = {
-            name: moments_of_mixture(each, torch.zeros_like(each), self.log_weights) for name, each in values.items()
+            name: moments_of_mixture(value.unflatten(0, weights.shape[:2]), 0.0, weights)
+            for name, value in values.items()
         }
         mean, variance = ({name: pair[i] for name, pair in moments.items()} for i in range(2))
         return {"mean": mean, "variance": variance, "states": self.state_probabilities(lag)}
@@ -345,7 +353,7 @@ class Particles:
         for s in range(t, max(t - lag, 0), -1):  # `later` is the log density of later data given the states so far
             later = (self.past_states["logs"][s].unflatten(1, self.shape) + self._following(later)).logsumexp(-1)
             joint = self.past_states["joint"][s - 1] + self._following(later).flatten(1)
-        weights = self.log_weights.softmax(0)[..., None]
+        weights = self.log_weights.exp()[..., None]
         total = (joint.softmax(1).unflatten(0, weights.shape[:2]) * weights).sum(0)
         names = [*sums.statics, *(f"{name} {i}" for i in range(sums.lag, -1, -1) for name in sums.chain)]
         total = total.unflatten(1, [sums.sizes[name.split(" ")[0]] for name in names])
@@ -564,21 +572,15 @@ def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
     return (particle * batch + torch.arange(batch, device=identity.device)).flatten()
 
 
-def moments_of_mixture(means: Tensor, variances: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
+def moments_of_mixture(means: Tensor, variances: Tensor | float, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean and variance (B, D) of a mixture.
 
     Args:
         means, variances: moments (C, B, D) of the components.
-        log_weights: their log weights (C, B), which need not be normalised.
+        weights: their weights (C, B, 1).
     """
-    weights = log_weights.softmax(0)[..., None]
     mean = (weights * means).sum(0)
     return mean, (weights * (variances + (means - mean).square())).sum(0)
-
-
-def log_mean(log_weights: Tensor) -> Tensor:
-    """Return the log mean (B,) of weights (K, B)."""
-    return log_weights.logsumexp(0) - math.log(len(log_weights))
 
 
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, mask: Tensor | None = None) -> Tensor:
