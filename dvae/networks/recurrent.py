@@ -236,7 +236,7 @@ class MemoryState:
         """The base (B, H) of each step, or a single base for all steps."""
         return self.base.unbind(1)
 
-    def select(self, rows: Tensor) -> MemoryState:
+    def select(self, rows: Tensor | None) -> MemoryState:
         """Return the state of the batch rows with indices (N,), without a copy of the base."""
         selected = MemoryState(self.base, self.live, select(self.lengths, rows), select(self.hidden, rows))
         selected.steps = select(self.steps, rows)
@@ -417,7 +417,7 @@ class RecurrentState:
     given: dict[str, Tensor]
     lengths: Tensor | None
 
-    def select(self, rows: Tensor) -> RecurrentState:
+    def select(self, rows: Tensor | None) -> RecurrentState:
         """Return the state of the batch rows with indices (N,); the given parents are unchanged."""
         selected = {name: select(getattr(self, name), rows) for name in ("hoisted", "memories", "extracted", "lengths")}
         return replace(self, **selected)

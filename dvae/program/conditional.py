@@ -435,8 +435,8 @@ class Conditional(nn.Module):
                 steps[s] = torch.cat([value, torch.ones_like(value) if masks[s] is None else masks[s].to(value)], -1)
         return steps
 
-    def select(self, state: Any, rows: Tensor) -> Any:
-        """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles."""
+    def select(self, state: Any, rows: Tensor | None) -> Any:
+        """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles; see `select`."""
         if self.network is None:
             return select(state, rows)
         if not isinstance(state, Standardised):

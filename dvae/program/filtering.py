@@ -223,8 +223,9 @@ class Filter:
             raise ValueError(f"resample_below must be a share of the particles, from 0 to 1, got {resample_below}")
         self.model, self.lag, self.resample_below, self.steps = model, lag, resample_below, 0
         seed = int(torch.randint(2**62, ())) if seed is None else seed
-        self.module: Any = torch.cuda if like(model).is_cuda else torch
-        with seeded(seed, like(model).device):
+        self.device = like(model).device
+        self.module: Any = torch.cuda if self.device.type == "cuda" else torch
+        with seeded(seed, self.device):
             self.random = self.module.get_rng_state()
         self.uniform = torch.Generator().manual_seed(seed)
         with self._running():
@@ -271,7 +272,7 @@ class Filter:
     @contextmanager
     def _running(self) -> Iterator[None]:
         """Run programs of the model with the random numbers of the filter, which other draws do not change."""
-        with self.model.running(), torch.no_grad(), seeded(None, like(self.model).device):
+        with self.model.running(), torch.no_grad(), seeded(None, self.device):
             self.module.set_rng_state(self.random)
             yield
             self.random = self.module.get_rng_state()
@@ -307,7 +308,7 @@ class Filter:
         names = self._context_names
         if other := [name for name in context or {} if name not in names]:
             raise ValueError(f"a prediction reads {', '.join(names) or 'no context'}; leave out {', '.join(other)}")
-        with self._running(), seeded(None, like(self.model).device):
+        with self._running(), seeded(None, self.device):
             engine = self.engine.fork()
             engine.begin(self.resample_below)
             if names:
@@ -414,11 +415,12 @@ class Filter:
         loaded.model, loaded.endless = model, ""
         for name in SETTINGS:
             setattr(loaded, name, settings[name])
-        loaded.module = torch.cuda if like(model).is_cuda else torch
+        loaded.device = like(model).device
+        loaded.module = torch.cuda if loaded.device.type == "cuda" else torch
         loaded.random, loaded.uniform = tensors.pop("random"), torch.Generator()
         loaded.uniform.set_state(tensors.pop("uniform"))
-        # copies are aligned in memory, as bits of a result may depend on the alignment
-        tensors = {name: value.to(like(model).device, copy=True) for name, value in tensors.items()}
+        # copies, because the tensors of a file are not aligned in memory
+        tensors = {name: value.to(loaded.device, copy=True) for name, value in tensors.items()}
         statics = {name.removeprefix("static/"): v for name, v in tensors.items() if name.startswith("static/")}
         empty = {
             n: torch.zeros(settings["batch"], 1, model.sizes[n])
@@ -466,8 +468,11 @@ def _settings(content: bytes, path: Any) -> dict[str, Any]:
 
 def _exchange(state: Any, path: str, tensors: dict[str, Tensor], load: bool) -> Any:
     """Store the tensors of a state by path, or replace them if `load`, in place where possible; return the state."""
-    if isinstance(state, Tensor) or (load and path in tensors):
-        return tensors[path] if load else tensors.setdefault(path, state)
+    if load and (path in tensors or isinstance(state, Tensor)):  # equal tensors keep their layout in memory, on which the last bits of sums depend
+        is_equal = isinstance(state, Tensor) and torch.equal(state, tensors[path])
+        return state if is_equal else tensors[path]
+    if isinstance(state, Tensor):
+        return tensors.setdefault(path, state)
     if isinstance(state, Rows):
         parts = {str(t): state[t] for t in range(len(state))}
     elif isinstance(state, list | tuple):

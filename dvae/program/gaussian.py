@@ -17,7 +17,7 @@ from torch import Tensor
 from ..distributions.base import Parameters
 from ..distributions.families import FixedNormalModule, Gaussian
 from ..networks.linear import LinearNetwork
-from ..networks.loop import Rows, slide
+from ..networks.loop import Rows
 from ..networks.recurrent import RecurrentNetwork
 from .conditional import Conditional, like
 from .rollout import Rollout
@@ -87,7 +87,8 @@ class GaussianFilter:
         if self.live and self.position == self.known.length - 1:
             kept = [*range(self.static_size), *range(self.static_size + sum(self.sizes), self.mean.shape[1])]
             self.mean, self.covariance = self.mean[:, kept], self.covariance[:, kept][:, :, kept]
-            slide(self.context)
+            for rows in self.context.values():
+                rows.slide()
         self.position = min(self.position + 1, self.known.length - 1)
         return torch.zeros(self.known.batch, dtype=torch.bool, device=self.mean.device)
 

@@ -29,7 +29,7 @@ from ..distributions.base import Parameters
 from ..factorization.notation import Factor, Parent
 from ..locking import seeded
 from ..networks.base import indicator, presence
-from ..networks.loop import Rows, memoizing, pick, select, slide, valid_steps
+from ..networks.loop import Rows, histories, memoizing, pick, select, valid_steps
 from .conditional import Conditional, like
 from .rollout import Rollout
 
@@ -69,6 +69,7 @@ class Particles:
             for factor in model.generative.factors
         }
         """Variables of the same step that each variable reads."""
+        self.drawn_names = self._local(model.latents)
         self.read_now = {name for names in self.instant.values() for name in names}
         missing = hidden_data(known)
         self.hidden = [
@@ -76,7 +77,8 @@ class Particles:
         ]
         self.shared = {name: value for name, value in known.values.items() if name not in self.hidden}
         self.late = late_statics(model) if proposal is None else set()
-        self.sequence = torch.arange(known.batch, device=like(model).device).repeat(particles)
+        self.log_weights = like(model).new_zeros(particles, known.batch)
+        self.sequence = torch.arange(known.batch, device=self.log_weights.device).repeat(particles)
         self.statics: dict[str, Rows] = {}
         self.paths = self._slots([*self._local(model.latents), *self.hidden])
         if live:
@@ -146,25 +148,27 @@ class Particles:
         low = low if valid is None else low & valid
         if self.position < 0 and not self.statics:
             low = torch.zeros_like(low)
-        if low.any():
+        if self.particles > 1 and low.any():
             self._select(ancestors(self.log_weights, low))
             self.log_weights = self.log_weights.masked_fill(low, -math.log(self.particles))
         if self.position == self.known.length - 1:
-            slide([self.paths, self.data, self.masks, self.guide, self.prior, self.past_states])
+            stepwise = [each.state for each in (*self.guide.values(), *self.prior.values()) if each.has_history]
+            for rows in histories([self.paths, self.data, self.masks, self.past_states, stepwise]):
+                rows.slide()
         self.position = min(self.position + 1, self.known.length - 1)
-        self.noise = {name: self._noise(self.model.encoder[name]) for name in self._local(self.model.latents)}
+        self.noise = {name: self._noise(self.model.encoder[name]) for name in self.drawn_names}
         self.ahead = {}
         return low
 
-    def _select(self, rows: Tensor, *names: str) -> None:
-        """Replace particles by those with these rows (N,)."""
+    def _select(self, rows: Tensor | None, *names: str) -> None:
+        """Replace particles by those with these rows (N,), or by copies."""
         names = ("statics", "paths", "guide", "prior", "states", "past_states", *names)
         vars(self).update(zip(names, select([getattr(self, name) for name in names], rows), strict=True))
 
     def fork(self) -> Particles:
         """Return a copy whose steps do not change these particles."""
         forked = copy(self)
-        forked._select(torch.arange(len(self.sequence), device=self.sequence.device), "data", "masks")
+        forked._select(None, "data", "masks")
         return forked
 
     def feed(self, run: Rollout, t: int, names: list[str]) -> None:
@@ -218,13 +222,14 @@ class Particles:
                     value = torch.where(observed, value, each.conditional.mean(parameters))
                 self.paths[name][t] = value
         self.log_weights = self.log_weights + total.view_as(self.log_weights)
-        self.joint = (start + logs).log_softmax(1)
-        for name in self.past_states:
-            self.past_states[name][t] = self.joint if name == "joint" else logs
-        windows = self.joint.unflatten(1, self.shape)
-        if self.shape[1] > 1:  # forget the oldest step of the window
-            windows = windows.flatten(-2).unflatten(-1, (self.shape[2], -1)).movedim(-2, -1)
-        self.states = windows.logsumexp(-1)
+        if self.model.summed:
+            self.joint = (start + logs).log_softmax(1)
+            for name in self.past_states:
+                self.past_states[name][t] = self.joint if name == "joint" else logs
+            windows = self.joint.unflatten(1, self.shape)
+            if self.shape[1] > 1:  # forget the oldest step of the window
+                windows = windows.flatten(-2).unflatten(-1, (self.shape[2], -1)).movedim(-2, -1)
+            self.states = windows.logsumexp(-1)
         return self.normalise()
 
     def predict(self) -> dict[str, tuple[Conditional, Parameters, Tensor]]:
@@ -233,14 +238,13 @@ class Particles:
         Each is a mixture of C components per sequence: its conditional, its parameters (C B, ...) and the log weights
         (C, B). Latents are drawn from the model, with the noise of the step.
         """
-        t, joint, result, everyone = self.position, self._joint(), {}, torch.arange(len(self.sequence))
-        history = overlay = {**self.data, **self.paths}
+        t, joint, result, history = self.position, self._joint(), {}, {**self.data, **self.paths}
         with nullcontext() if self.adopts else seeded(None, joint.device):  # later draws stay the same
             for name, each in self.prior.items():
                 if self.adopts or not (self.instant[name] or each.places is not None):
                     parameters = self.ahead[name] = each.step(t, history)
                 else:
-                    parameters = each.select(everyone.to(joint.device)).step(t, overlay)
+                    parameters = each.select(None).step(t, history)
                 if name in self.model.summed:
                     joint = joint + each.logits(parameters, t)
                     continue
@@ -254,7 +258,7 @@ class Particles:
                 if self.adopts:
                     self.paths[name][t] = value
                 else:
-                    overlay = {**overlay, name: overlay[name].replaced(t, value)}
+                    history[name] = history[name].replaced(t, value)
         return result
 
     def _draw(self, each: Stepwise, parameters: Parameters, name: str, joint: Tensor) -> Tensor:
@@ -375,7 +379,7 @@ class Particles:
 
     def _draw_statics(self, late: bool) -> Tensor:
         """Draw the static latents that precede the steps, or follow them if `late`, and return log weights (N,)."""
-        model, total = self.model, like(self.model).new_zeros(len(self.sequence))
+        model, total = self.model, self.log_weights.new_zeros(len(self.sequence))
         for name in model.latents:
             if not model.generative.local(name) and (name in self.late) == late and self.proposal[name] == "guide":
                 conditional = model.encoder[name]
@@ -396,7 +400,7 @@ class Particles:
         return total
 
     def _noise(self, conditional: Conditional) -> Tensor:
-        noise: Tensor = conditional.head.noise((len(self.sequence), conditional.size), like(self.model))
+        noise: Tensor = conditional.head.noise((len(self.sequence), conditional.size), self.log_weights)
         return noise
 
     def _parameters(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Parameters:
@@ -440,7 +444,8 @@ class Particles:
                 parents = {n: pick(value, rows) for n, value in parents.items()}
                 return Stepwise(conditional, None, reads, places, patterns, len(rows), parents)
         state = conditional.start(parents, size, self.known.length, lengths)
-        return Stepwise(conditional, conditional.select(state, rows), reads, places, patterns, len(rows))
+        state, has_history = conditional.select(state, rows), any(True for _ in histories(state))
+        return Stepwise(conditional, state, reads, places, patterns, len(rows), has_history=has_history)
 
     def _known_parents(
         self, conditional: Conditional, shared: Mapping[str, Tensor]
@@ -479,6 +484,7 @@ class Stepwise:
         patterns: n, number of patterns; row p N + i of the parameters is pattern p of particle i.
         rows: n N, number of rows.
         given: parents that do not change, for a conditional without a state.
+        has_history: whether the state contains draws of earlier steps.
     """
 
     conditional: Conditional
@@ -488,6 +494,7 @@ class Stepwise:
     patterns: int = 1
     rows: int = 0
     given: Mapping[str, Tensor] | None = None
+    has_history: bool = False
 
     def step(self, t: int, history: Mapping[str, Any]) -> Parameters:
         """Return the distribution's parameters (n N, D) at step t."""
@@ -531,9 +538,9 @@ class Stepwise:
     def _placed(self, logs: Tensor, t: int) -> Tensor:
         return logs.unflatten(0, (self.patterns, -1)).transpose(0, 1).flatten(1).index_select(1, self.place(t))
 
-    def select(self, rows: Tensor) -> Stepwise:
-        """Return the conditional for these particles."""
-        if self.patterns > 1:
+    def select(self, rows: Tensor | None) -> Stepwise:
+        """Return the conditional for these particles, or a copy for None."""
+        if self.patterns > 1 and rows is not None:
             first = torch.arange(self.patterns, device=rows.device)[:, None]
             rows = (first * (self.rows // self.patterns) + rows).flatten()
         state = (
