@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from copy import copy
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -36,10 +35,11 @@ class Rows(Sequence[Any]):
 
     def select(self, rows: Tensor | None) -> Rows:
         """Return the sequence for the batch rows with indices (N,), without copying any tensor; a copy for None."""
-        selected = copy(self)
-        selected.values, selected.written = list(self.values), list(self.written)
+        selected = Rows(self.values)
+        selected.written, selected.is_history = list(self.written), self.is_history
+        selected.moves, selected.origin = list(self.moves), self.origin
         if rows is not None:
-            selected.moves = [*self.moves, rows] if self.is_history else []
+            selected.moves += [rows] if self.is_history else []
             selected.origin = rows if self.origin is None else self.origin.index_select(0, rows)
         return selected
 
@@ -80,7 +80,7 @@ def pick(value: Tensor, rows: Tensor | None) -> Tensor:
     if rows is None:
         return value
     if value.shape[0] == 1 or value.stride(0) == 0:
-        return value[:1].expand(len(rows), *value.shape[1:])
+        return value[:1].expand(rows.shape[0], *value.shape[1:])
     return value.index_select(0, rows)
 
 

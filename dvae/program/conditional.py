@@ -286,7 +286,8 @@ class Conditional(nn.Module):
     @property
     def _output_units(self) -> Units | None:
         """Units of the child, if the parameters of its distribution can be transformed to them."""
-        return self.units.get(self.factor.child) if self.head.location_scale else None
+        units = self.units.get(self.factor.child)
+        return None if units is None or not self.head.location_scale else units
 
     def _rescale(self, parameters: Parameters, factors: Tensor | None = None) -> Parameters:
         if parameters and torch.is_autocast_enabled(parameters[0].device.type):

@@ -176,9 +176,13 @@ class Prediction:
             uniform: uniform numbers (B, D), which randomise between P(X < x) and P(X <= x).
         """
         distribution, weights = self.components[name]
-        below, upto = cdf(distribution, value.repeat(len(weights), 1))
-        shares = upto if below is upto else below + uniform.repeat(len(weights), 1) * (upto - below)
-        return (weights * shares.unflatten(0, weights.shape[:2])).sum(0)
+        count, batch = weights.shape[:2]
+        below, upto = cdf(distribution, value.expand(count, -1, -1).reshape(count * batch, -1))
+        shares = upto.unflatten(0, (count, batch))
+        if below is not upto:
+            below = below.unflatten(0, (count, batch))
+            shares = below + uniform * (shares - below)
+        return (weights * shares).sum(0)
 
     def sample(self, samples: int) -> dict[str, Tensor]:
         """Return draws (S, B, D) of each data variable, in the unit of the data.

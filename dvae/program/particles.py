@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -80,11 +80,12 @@ class Particles:
         self.log_weights = like(model).new_zeros(particles, known.batch)
         self.sequence = torch.arange(known.batch, device=self.log_weights.device).repeat(particles)
         self.statics: dict[str, Rows] = {}
-        self.paths = self._slots([*self._local(model.latents), *self.hidden])
+        self.paths = self._slots([*self.drawn_names, *self.hidden])
         if live:
             local = [*self.data_names, *(name for name in model.context if model.reader.local[name])]
-            self.data = self._slots([*local, *map(indicator, local), *map(presence, self._local(model.latents))])
-            self.masks: dict[str, Any] = {name: self._slots([name])[name] for name in self._local(self.order)}
+            names = [*local, *map(indicator, local), *map(presence, self.drawn_names)]
+            self.data: dict[str, Any] = {name: [None] * known.length for name in names}
+            self.masks: dict[str, Any] = {name: [None] * known.length for name in self._local(self.order)}
         else:
             self.data = {name: self._by_step(known.values[name]) for name in self.data_names}
             masks = {name: known.mask(name) for name in self._local(self.order)}
@@ -128,13 +129,8 @@ class Particles:
         return self.normalise()
 
     def normalise(self) -> Tensor:
-        """Divide the weights by their sum, and return its log (B,): the log evidence of the data since the last call.
-
-        If all weights of a sequence are 0, they become equal.
-        """
-        total = self.log_weights.logsumexp(0)
-        self.log_weights = torch.where(total > -math.inf, self.log_weights - total, -math.log(self.particles))
-        self.effective = effective_size(self.log_weights)
+        """Normalise the weights, and return the log of their sum (B,): the log evidence since the last call."""
+        self.log_weights, total, self.effective = normalise(self.log_weights)
         return total
 
     def begin(self, resample_below: float, valid: Tensor | None = None) -> Tensor:
@@ -152,23 +148,27 @@ class Particles:
             self._select(ancestors(self.log_weights, low))
             self.log_weights = self.log_weights.masked_fill(low, -math.log(self.particles))
         if self.position == self.known.length - 1:
-            stepwise = [each.state for each in (*self.guide.values(), *self.prior.values()) if each.has_history]
-            for rows in histories([self.paths, self.data, self.masks, self.past_states, stepwise]):
+            for values in (*self.data.values(), *self.masks.values()):
+                del values[0]
+                values.append(None)
+            states = [each.state for each in (*self.guide.values(), *self.prior.values()) if each.has_history]
+            for rows in (*self.paths.values(), *self.past_states.values(), *histories(states)):
                 rows.slide()
         self.position = min(self.position + 1, self.known.length - 1)
         self.noise = {name: self._noise(self.model.encoder[name]) for name in self.drawn_names}
         self.ahead = {}
         return low
 
-    def _select(self, rows: Tensor | None, *names: str) -> None:
+    def _select(self, rows: Tensor | None) -> None:
         """Replace particles by those with these rows (N,), or by copies."""
-        names = ("statics", "paths", "guide", "prior", "states", "past_states", *names)
+        names = ("statics", "paths", "guide", "prior", "states", "past_states")
         vars(self).update(zip(names, select([getattr(self, name) for name in names], rows), strict=True))
 
     def fork(self) -> Particles:
         """Return a copy whose steps do not change these particles."""
         forked = copy(self)
-        forked._select(None, "data", "masks")
+        forked._select(None)
+        forked.data, forked.masks = ({n: [*v] for n, v in values.items()} for values in (self.data, self.masks))
         return forked
 
     def feed(self, run: Rollout, t: int, names: list[str]) -> None:
@@ -546,7 +546,9 @@ class Stepwise:
         state = (
             self.conditional.select(self.state, rows) if self.reads and self.given is None else select(self.state, rows)
         )
-        return replace(self, state=state, given=None if self.given is None else select(dict(self.given), rows))
+        selected = copy(self)
+        selected.state, selected.given = state, None if self.given is None else select(dict(self.given), rows)
+        return selected
 
 
 def _tile(value: Any, count: int) -> Any:
@@ -558,10 +560,17 @@ def is_windowed(conditional: Conditional) -> bool:
     return conditional.network is not None and not conditional.network.streams
 
 
-def effective_size(log_weights: Tensor) -> Tensor:
-    """Return the effective sample size (B,) of weights (K, B): (sum w)^2 / sum w^2."""
-    weights = (log_weights - log_weights.amax(0)).exp()  # the difference of two large logs would lose all digits
-    return weights.sum(0).square() / weights.square().sum(0)
+def normalise(log_weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return normalised log weights (K, B), the log of the sum of the weights (B,), and the effective sample size (B,).
+
+    The effective sample size is (sum w)^2 / sum w^2. If all weights of a sequence are 0, they become equal.
+    """
+    largest = log_weights.amax(0)
+    relative = torch.where(largest > -math.inf, log_weights - largest, 0.0)
+    weights = relative.exp()
+    total = weights.sum(0)
+    log_total = total.log()
+    return relative - log_total, largest + log_total, total.square() / weights.square().sum(0)
 
 
 def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
@@ -571,12 +580,12 @@ def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
     where `mask` (B,) is False are their own ancestors.
     """
     count, batch = log_weights.shape
-    identity = torch.arange(count, device=log_weights.device)[:, None]
-    cumulative = log_weights.double().softmax(0).cumsum(0)
-    points = (identity + torch.rand(batch, dtype=torch.double, device=identity.device)) / count * cumulative[-1]
-    resampled = torch.searchsorted(cumulative.t().contiguous(), points.t().contiguous(), right=True).t()
-    particle = torch.where(mask, resampled.clamp_(max=count - 1), identity)
-    return (particle * batch + torch.arange(batch, device=identity.device)).flatten()
+    identity = torch.arange(count * batch, device=log_weights.device).view(count, batch)
+    cumulative = log_weights.t().double().softmax(1).cumsum(1).contiguous()
+    uniform = torch.rand(batch, 1, dtype=torch.double, device=log_weights.device)
+    points = (torch.arange(count, device=log_weights.device) + uniform) / count * cumulative[:, -1:]
+    particle = torch.searchsorted(cumulative, points, right=True).clamp_(max=count - 1)
+    return torch.where(mask, particle.t() * batch + identity[0], identity).flatten()
 
 
 def moments_of_mixture(means: Tensor, variances: Tensor | float, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,7 @@ from ...networks.loop import valid_steps
 from ...program.batch import AnyBatch, repeat
 from ...program.gaussian import is_linear_gaussian
 from ...program.model import DynamicalVAE
-from ...program.particles import effective_size, reads_ahead
+from ...program.particles import normalise, reads_ahead
 from .elbo import importance_weights, require_data, require_densities
 from .particles import fivo_bound, obstacle
 
@@ -169,7 +169,8 @@ def _evidences(model: DynamicalVAE, data: Batch, particles: int, chunk: int) -> 
     if obstacle(model, data):
         weights = importance_weights(model, data, size, REPLICATES * particles, chunk)
         log_weights = weights.unflatten(0, (REPLICATES, -1)).transpose(0, 1)
-        return log_weights.logsumexp(0) - math.log(particles), effective_size(log_weights).mean(0)
+        _, total, effective = normalise(log_weights)
+        return total - math.log(particles), effective.mean(0)
     bound = fivo_bound(model, repeat(data, REPLICATES), particles, chunk=chunk)
     least = bound.effective.nan_to_num(math.inf).amin(0)
     return bound.bound.unflatten(0, (REPLICATES, -1)), least.unflatten(0, (REPLICATES, -1)).mean(0)
