@@ -55,8 +55,12 @@ def evaluating(*modules: nn.Module) -> Iterator[None]:
 
 def like(module: nn.Module) -> Tensor:
     """Return any parameter or buffer of the module, which shows its dtype and device."""
-    for tensor in module.parameters():
-        return tensor
+    parts = [module]
+    while parts:  # `parameters` visits all names, and a filter calls this function at each step
+        part = parts.pop()
+        if tensors := [tensor for tensor in part._parameters.values() if tensor is not None]:
+            return tensors[0]
+        parts += filter(None, part._modules.values())
     return next(module.buffers())
 
 
@@ -437,7 +441,7 @@ class Conditional(nn.Module):
         return steps
 
     def select(self, state: Any, rows: Tensor | None) -> Any:
-        """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles; see `select`."""
+        """Return the state of a loop for the given rows (N,) of the batch, or a copy for None (`loop.select`)."""
         if self.network is None:
             return select(state, rows)
         if not isinstance(state, Standardised):

@@ -163,8 +163,8 @@ class Prediction:
                 variances = distribution.variance
             except (NotImplementedError, AttributeError):  # some distributions have no formula
                 variances = torch.full_like(means, math.nan)
-            shape = weights.shape[:2]
-            moments[name] = moments_of_mixture(means.unflatten(0, shape), variances.unflatten(0, shape), weights)
+            shape = *weights.shape[:2], -1
+            moments[name] = moments_of_mixture(means.reshape(shape), variances.reshape(shape), weights)
         return moments
 
     def pit(self, name: str, value: Tensor, uniform: Tensor) -> Tensor:
@@ -178,9 +178,9 @@ class Prediction:
         distribution, weights = self.components[name]
         count, batch = weights.shape[:2]
         below, upto = cdf(distribution, value.expand(count, -1, -1).reshape(count * batch, -1))
-        shares = upto.unflatten(0, (count, batch))
+        shares = upto.reshape(count, batch, -1)
         if below is not upto:
-            below = below.unflatten(0, (count, batch))
+            below = below.reshape(count, batch, -1)
             shares = below + uniform * (shares - below)
         return (weights * shares).sum(0)
 
@@ -276,10 +276,14 @@ class Filter:
     @contextmanager
     def _running(self) -> Iterator[None]:
         """Run programs of the model with the random numbers of the filter, which other draws do not change."""
-        with self.model.running(), torch.no_grad(), seeded(None, self.device):
-            self.module.set_rng_state(self.random)
-            yield
-            self.random = self.module.get_rng_state()
+        with self.model.running(), torch.no_grad():
+            outside = self.module.get_rng_state()
+            try:
+                self.module.set_rng_state(self.random)
+                yield
+                self.random = self.module.get_rng_state()
+            finally:
+                self.module.set_rng_state(outside)
 
     def update(self, batch: AnyBatch) -> Filtered:
         """Continue with new steps, in constant time and memory per step.
@@ -380,7 +384,8 @@ class Filter:
                 lagged = engine.summary(self.lag)
                 step |= {f"lagged_{field}": values for field, values in lagged.items()}
             if not isinstance(engine, GaussianFilter) and model.latents:
-                step["particles"] = {n: v.unflatten(0, (self.count, -1)) for n, v in engine.latents().items()}
+                shape = self.count, run.batch, -1
+                step["particles"] = {name: value.reshape(shape) for name, value in engine.latents().items()}
                 step["log_weights"] = engine.log_weights
             self.steps += 1
             steps.append(step)
@@ -472,7 +477,8 @@ def _settings(content: bytes, path: Any) -> dict[str, Any]:
 
 def _exchange(state: Any, path: str, tensors: dict[str, Tensor], load: bool) -> Any:
     """Store the tensors of a state by path, or replace them if `load`, in place where possible; return the state."""
-    if load and (path in tensors or isinstance(state, Tensor)):  # equal tensors keep their layout in memory, on which the last bits of sums depend
+    if load and (path in tensors or isinstance(state, Tensor)):
+        # equal tensors keep their layout in memory, on which the last bits of sums depend
         is_equal = isinstance(state, Tensor) and torch.equal(state, tensors[path])
         return state if is_equal else tensors[path]
     if isinstance(state, Tensor):

@@ -62,6 +62,9 @@ class GaussianFilter:
         self.statics = [name for name in order if not model.generative.local(name)]
         self.sizes = [model.sizes[name] for name in self.local]
         self.context = {n: Rows([None] * known.length) for n in model.context if live and model.reader.local[n]}
+        self.read_context = {name for name in order if self.context.keys() & model.generator[name].parents}
+        self.maps: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+        """Results of `_affine` in the last step of the window of a stream, which does not move any more."""
         self.position = -1
 
     def start(self) -> Tensor:
@@ -85,10 +88,12 @@ class GaussianFilter:
     def begin(self, resample_below: float, valid: Tensor | None = None) -> Tensor:
         """Move to the next step."""
         if self.live and self.position == self.known.length - 1:
-            kept = [*range(self.static_size), *range(self.static_size + sum(self.sizes), self.mean.shape[1])]
-            self.mean, self.covariance = self.mean[:, kept], self.covariance[:, kept][:, :, kept]
-            for rows in self.context.values():
-                rows.slide()
+            kept = slice(self.static_size), slice(self.static_size + sum(self.sizes), None)
+            self.mean = torch.cat([self.mean[:, part] for part in kept], 1)
+            rows = torch.cat([self.covariance[:, part] for part in kept], 1)
+            self.covariance = torch.cat([rows[:, :, part] for part in kept], 2)
+            for values in self.context.values():
+                values.slide()
         self.position = min(self.position + 1, self.known.length - 1)
         return torch.zeros(self.known.batch, dtype=torch.bool, device=self.mean.device)
 
@@ -123,12 +128,13 @@ class GaussianFilter:
             spread = spread * observed[:, :, None] * observed[:, None] + torch.diag_embed(1 - observed)
             residual = (value - self.mean[:, part]) * observed
             root = torch.linalg.cholesky(spread)
-            white = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
-            gain = torch.cholesky_solve((self.covariance[:, :, part] * observed[:, None]).mT, root).mT
+            across = self.covariance[:, part] * observed[..., None]
+            solved = torch.linalg.solve_triangular(root, torch.cat([residual[..., None], across], 2), upper=False)
+            white, gain = solved[..., 0], solved[..., 1:]
             log_density = -0.5 * white.square().sum(1) - root.diagonal(dim1=1, dim2=2).log().sum(1)
             total = total + log_density - 0.5 * math.log(2 * math.pi) * observed.sum(1)
-            self.mean = self.mean + (gain @ residual[..., None])[..., 0]
-            covariance = self.covariance - gain @ spread @ gain.mT
+            self.mean = self.mean + (gain.mT @ white[..., None])[..., 0]
+            covariance = self.covariance - gain.mT @ gain
             # the model reads the value where it was observed, and its own mean elsewhere
             self.mean[:, part] = torch.where(observed > 0, value, self.mean[:, part])
             uncertain = torch.ones_like(self.mean)
@@ -156,11 +162,26 @@ class GaussianFilter:
 
     def _extend(self, name: str, noisy: bool) -> Tensor:
         """Append a variable at the current step, with or without its noise, and return its noise scale (R, D)."""
+        weights, offset, scale = self.maps[name] if name in self.maps else self._affine(name, self.position + 1)
+        if self.live and self.position == self.known.length - 1 and name not in self.read_context:
+            self.maps[name] = weights, offset, scale
+        mean = (weights @ self.mean[..., None])[..., 0] + offset
+        across = weights @ self.covariance
+        within = across @ weights.mT + (torch.diag_embed(scale.square()) if noisy else 0.0)
+        self.mean = torch.cat([self.mean, mean], 1)
+        self.covariance = torch.cat([torch.cat([self.covariance, across.mT], 2), torch.cat([across, within], 2)], 1)
+        return scale
+
+    def _affine(self, name: str, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return weights (R, D, S), offset and noise scale (R, D) of a variable given the S coordinates so far.
+
+        R is 1, or B if the variable reads context. S includes variables of its own step.
+        """
         conditional, (batch, size) = self.model.generator[name], self.mean.shape
         probes = torch.cat([self.mean.new_zeros(1, size), torch.eye(size).to(self.mean)])
         names = [n for n in conditional.parents if n in self.model.context]
         count = batch if names else 1
-        probes, steps, values = probes.repeat(count, 1).to(like(self.model)), self.position + 1, {}
+        probes, values = probes.repeat(count, 1).to(like(self.model)), {}
         for each in self.statics:
             if conditional.factor.parent(each) is not None:
                 values[each] = probes[:, self._part(each, 0)]
@@ -179,10 +200,4 @@ class GaussianFilter:
         if conditional.factor.local:
             location, scale = location[:, -1], scale[:, -1]
         location, scale = (part.double().unflatten(0, (count, size + 1)) for part in (location, scale))
-        weights, scale = (location[:, 1:] - location[:, :1]).mT, scale[:, 0]
-        mean = (weights @ self.mean[..., None])[..., 0] + location[:, 0]
-        across = weights @ self.covariance
-        within = across @ weights.mT + (torch.diag_embed(scale.square()) if noisy else 0.0)
-        self.mean = torch.cat([self.mean, mean], 1)
-        self.covariance = torch.cat([torch.cat([self.covariance, across.mT], 2), torch.cat([across, within], 2)], 1)
-        return scale
+        return (location[:, 1:] - location[:, :1]).mT, location[:, 0], scale[:, 0]

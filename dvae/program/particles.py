@@ -161,7 +161,7 @@ class Particles:
 
     def _select(self, rows: Tensor | None) -> None:
         """Replace particles by those with these rows (N,), or by copies."""
-        names = ("statics", "paths", "guide", "prior", "states", "past_states")
+        names = "statics", "paths", "guide", "prior", *(("states", "past_states") if self.model.summed else ())
         vars(self).update(zip(names, select([getattr(self, name) for name in names], rows), strict=True))
 
     def fork(self) -> Particles:
@@ -192,7 +192,7 @@ class Particles:
             masks[self.position] = None if mask is None else pick(mask[:, t], self.sequence)
 
     def weigh(self) -> Tensor:
-        """Draw the latents at the step from their proposals, multiply the weights by those of the step, and `normalise`."""
+        """Draw the latents at the step from their proposals, and update and `normalise` the weights."""
         t, total = self.position, self.log_weights.new_zeros(len(self.sequence))
         reads = {**self.paths, **self.data}  # the guide reads data as given, and the model its means where they miss
         for name, each in self.guide.items():
@@ -316,7 +316,7 @@ class Particles:
         """Return moments (B, D) of each latent, and of states their probabilities, `lag` steps ago given all data."""
         weights, values = self.log_weights.exp()[..., None], self.latents(lag)
         moments = {
-            name: moments_of_mixture(value.unflatten(0, weights.shape[:2]), 0.0, weights)
+            name: moments_of_mixture(value.reshape(*weights.shape[:2], -1), 0.0, weights)
             for name, value in values.items()
         }
         mean, variance = ({name: pair[i] for name, pair in moments.items()} for i in range(2))
@@ -373,6 +373,8 @@ class Particles:
 
     def _joint(self) -> Tensor:
         """Return log weights (N, J) of the joint discrete states, before any variable of the step."""
+        if not self.model.summed:
+            return self.states[..., 0]
         return self.states[..., None].expand(*self.states.shape, self.shape[2]).flatten(1)
 
     # Static variables, and networks -------------------------------------------------------------------------------
@@ -546,9 +548,10 @@ class Stepwise:
         state = (
             self.conditional.select(self.state, rows) if self.reads and self.given is None else select(self.state, rows)
         )
-        selected = copy(self)
-        selected.state, selected.given = state, None if self.given is None else select(dict(self.given), rows)
-        return selected
+        given = None if self.given is None else select(dict(self.given), rows)
+        return Stepwise(
+            self.conditional, state, self.reads, self.places, self.patterns, self.rows, given, self.has_history
+        )
 
 
 def _tile(value: Any, count: int) -> Any:
