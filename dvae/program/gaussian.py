@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from ..distributions.base import Parameters
 from ..distributions.families import FixedNormalModule, Gaussian
@@ -58,9 +59,14 @@ class GaussianFilter:
     def __init__(self, model: Any, known: Rollout, live: bool):
         self.model, self.known, self.live = model, known, live
         order = [name for block in model.generative.blocks for name in block.names]
-        self.local = [name for name in order if model.generative.local(name)]
+        read = {parent.name for factor in model.generative.factors for parent in factor.parents}
+        unread = [name for name in model.observed if name not in read]  # forgotten at the end of each step
+        kept = [name for name in order if model.generative.local(name) and name not in unread]
+        self.local = [*kept, *unread]
         self.statics = [name for name in order if not model.generative.local(name)]
         self.sizes = [model.sizes[name] for name in self.local]
+        self.kept = {name: model.sizes[name] for name in kept}
+        self.width = sum(self.kept.values())
         self.context = {n: Rows([None] * known.length) for n in model.context if live and model.reader.local[n]}
         self.read_context = {name for name in order if self.context.keys() & model.generator[name].parents}
         self.maps: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
@@ -88,7 +94,7 @@ class GaussianFilter:
     def begin(self, resample_below: float, valid: Tensor | None = None) -> Tensor:
         """Move to the next step."""
         if self.live and self.position == self.known.length - 1:
-            kept = slice(self.static_size), slice(self.static_size + sum(self.sizes), None)
+            kept = slice(self.static_size), slice(self.static_size + self.width, None)
             self.mean = torch.cat([self.mean[:, part] for part in kept], 1)
             rows = torch.cat([self.covariance[:, part] for part in kept], 1)
             self.covariance = torch.cat([rows[:, :, part] for part in kept], 2)
@@ -130,16 +136,18 @@ class GaussianFilter:
             root = torch.linalg.cholesky(spread)
             across = self.covariance[:, part] * observed[..., None]
             solved = torch.linalg.solve_triangular(root, torch.cat([residual[..., None], across], 2), upper=False)
-            white, gain = solved[..., 0], solved[..., 1:]
+            white, across = solved[..., 0], solved[..., 1:]
             log_density = -0.5 * white.square().sum(1) - root.diagonal(dim1=1, dim2=2).log().sum(1)
             total = total + log_density - 0.5 * math.log(2 * math.pi) * observed.sum(1)
-            self.mean = self.mean + (gain.mT @ white[..., None])[..., 0]
-            covariance = self.covariance - gain.mT @ gain
+            self.mean = self.mean + (across.mT @ white[..., None])[..., 0]
+            covariance = self.covariance - across.mT @ across
             # the model reads the value where it was observed, and its own mean elsewhere
             self.mean[:, part] = torch.where(observed > 0, value, self.mean[:, part])
             uncertain = torch.ones_like(self.mean)
             uncertain[:, part] = 1 - observed
             self.covariance = (covariance + covariance.mT) / 2 * uncertain[:, :, None] * uncertain[:, None]
+        kept = self.static_size + (self.position + 1) * self.width
+        self.mean, self.covariance = self.mean[:, :kept], self.covariance[:, :kept, :kept]
         return total
 
     def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
@@ -157,7 +165,7 @@ class GaussianFilter:
             first = sum(self.model.sizes[other] for other in self.statics[: self.statics.index(name)])
         else:
             index = self.local.index(name)
-            first = self.static_size + position * sum(self.sizes) + sum(self.sizes[:index])
+            first = self.static_size + position * self.width + sum(self.sizes[:index])
         return slice(first, first + self.model.sizes[name])
 
     def _extend(self, name: str, noisy: bool) -> Tensor:
@@ -186,9 +194,9 @@ class GaussianFilter:
             if conditional.factor.parent(each) is not None:
                 values[each] = probes[:, self._part(each, 0)]
         if conditional.factor.local:
-            rest = probes.new_zeros(len(probes), steps * sum(self.sizes))
-            rest[:, : size - self.static_size] = probes[:, self.static_size :]
-            values |= dict(zip(self.local, rest.unflatten(1, (steps, -1)).split(self.sizes, -1), strict=True))
+            rest = functional.pad(probes[:, self.static_size :], (0, steps * self.width + self.static_size - size))
+            parts = rest.view(-1, steps, self.width).split([*self.kept.values()], -1) if self.kept else ()
+            values |= dict(zip(self.kept, parts, strict=True))
         for each in names:
             value = self.known.values.get(each)
             if value is None:
