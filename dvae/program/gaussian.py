@@ -35,10 +35,15 @@ def is_linear_gaussian(model: Any) -> bool:
 
 
 def _is_linear(conditional: Conditional) -> bool:
-    network, head, units = conditional.network, conditional.head, conditional.units
+    units = conditional.units
     has_logarithms = any(units[name].logarithms for name in conditional.parents if name in units)
-    if has_logarithms or conditional.exposure is not None or conditional.offset is not None:
-        return False
+    is_standard = conditional.exposure is None and conditional.offset is None
+    return is_standard and not has_logarithms and is_affine_normal(conditional)
+
+
+def is_affine_normal(conditional: Conditional) -> bool:
+    """Return whether a conditional is a normal with an affine network and a scale that does not depend on parents."""
+    network, head = conditional.network, conditional.head
     if network is None:
         return isinstance(head, Gaussian)
     is_affine = isinstance(network, LinearNetwork)

@@ -98,7 +98,8 @@ def leave_future_out(
         batch: batch as in `DynamicalVAE.model`, which may be ragged or have missing entries.
         observed: L, number of steps before the first forecast.
         horizon: M, number of steps of each forecast.
-        particles: K, number of particles of each of the R estimates.
+        particles: K, number of particles of each of the R estimates. Double it until the Monte Carlo error is small
+            compared with the differences between models and the smallest effective sample size is above 20.
         chunk: largest number of sequences times particles in memory.
 
     Raises:
