@@ -304,7 +304,8 @@ def windows_to_forecast(windows: Any, whole: bool = False) -> dict[str, np.ndarr
     if hasattr(held.windows, "times"):
         times, calendar = held.windows.times(x.shape[1])
         if times is not None:
-            arrays["time"] = np.reshape([str(time) for time in calendar.to_pandas(times.ravel())], times.shape)
+            moments, places = np.unique(times, return_inverse=True)
+            arrays["time"] = np.array([calendar.text(moment) for moment in moments])[places.reshape(times.shape)]
     return {name: np.array(value) for name, value in arrays.items()}
 
 
