@@ -30,7 +30,7 @@ class Rows(Sequence[Any]):
         self.written = [0] * len(values)
         self.moves: list[Tensor] = []  # of rows since the first value was written
         self.origin: Tensor | None = None  # composition of all moves, which selects hoisted work in one step
-        # of draws, rather than of work done before a loop, which no step replaces
+        # a history of draws has steps without a tensor so far; work done before a loop does not
         self.is_history = any(value is None for value in self.values)
 
     def select(self, rows: Tensor | None) -> Rows:

@@ -213,6 +213,8 @@ class Prediction:
 class Filter:
     """The state of a filter after some steps; `DynamicalVAE.filter` builds it.
 
+    The weights of the model must not change between steps.
+
     Attributes:
         filtered: results of the steps of the last call; there are none after `load`.
         proposal: as in `Filtered`.
