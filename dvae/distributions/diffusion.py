@@ -57,7 +57,7 @@ class Diffusion:
     By default, a perceptron denoises the variable at one step (or a static variable) given the features. With a
     `denoiser`, all steps are denoised jointly, for a factor p(x_{1:T} | h). Its parents must be static, or read at
     {1:T}, {<=t} or {<t}. The denoiser at step t then reads the noisy steps 1 to T, or 1 to t if a parent is restricted
-    to the past. Entries are observed or missing by step.
+    to the past.
 
     Without `drop`, m and s are linear functions of the features. Otherwise they do not depend on the features.
 
@@ -183,11 +183,10 @@ class DenoisingModule(ConditionalDistribution):
     """Base class of the modules of `Diffusion` and `FlowMatching`.
 
     Its parameters are the location m (..., D), the scale s (..., D) and the features h (..., H). If all steps are
-    drawn jointly, a further parameter (B, T, 1) is 1 at observed steps, 0 at missing steps and -1 at padding. The
-    denoiser then has a density for the steps that are 1, and ignores all others.
+    drawn jointly, a further parameter (B, T, D) is 1 at observed entries, 0 at missing ones and -1 at padding. The
+    denoiser then has a density for the entries that are 1, and ignores all others.
     """
 
-    event_dim = 1
     location_scale = True
     centred = True
 
@@ -216,6 +215,7 @@ class DenoisingModule(ConditionalDistribution):
                 "use denoiser=None"
             )
         self.spec, self.joint_steps = spec, spec.joint
+        self.event_dim = 0 if spec.joint else 1
         self.denoiser: Any = spec.denoiser.build(shape) if spec.joint else StepDenoiser(spec.hidden, shape)
         self.hidden_features = nn.Parameter(torch.zeros(shape.features)) if spec.drop else None
 
@@ -224,7 +224,7 @@ class DenoisingModule(ConditionalDistribution):
         raise NotImplementedError
 
     def score(self, parameters: Parameters, value: Tensor) -> Tensor:
-        """Return `log_prob` of the Pyro distribution, (...), for values (..., D)."""
+        """Return the contribution (..., D) of each entry of values (..., D) to `log_prob` of the Pyro distribution."""
         raise NotImplementedError
 
     @override
@@ -306,7 +306,7 @@ class DenoisingModule(ConditionalDistribution):
     def exact_log_prob(self, parameters: Parameters, value: Tensor, steps: int, probes: int | None) -> ODEDensity:
         """Return the density by the probability-flow ODE, as `DenoisingDistribution.exact_log_prob` does."""
         loc, scale, features, *seen = parameters
-        counted = (seen[0] > 0).to(loc.dtype) if seen else torch.ones_like(loc[..., :1])
+        counted = (seen[0] > 0).to(loc.dtype) if seen else torch.ones_like(loc)
         event = 2 if self.joint_steps else 1
         if probes is None:
             probes = 0 if math.prod(value.shape[-event:]) <= EXACT_DIMENSION else 16
@@ -396,10 +396,7 @@ class DiffusionModule(DenoisingModule):
         u, v, guess, times = self._estimate(parameters, value)
         signal = torch.sigmoid(-self.noise_range[0])  # cos^2 of the lowest angle
         constant = math.log(2 * math.pi) + 1 - signal - signal.log()
-        entries = (
-            self.weight(times) * guess * (2 * v - guess) - (signal * u.square() + constant) / 2 - parameters[1].log()
-        )
-        return entries.sum(-1)
+        return self.weight(times) * guess * (2 * v - guess) - (signal * u.square() + constant) / 2 - parameters[1].log()
 
 
 class FlowMatchingModule(DenoisingModule):
@@ -426,7 +423,7 @@ class FlowMatchingModule(DenoisingModule):
         _, v, guess, times = self._estimate(parameters, value)
         angle = self.angle(times)
         # the derivative of the path, e - u, is (sin a - cos a) z + (cos a + sin a) v
-        return -((angle.cos() + angle.sin()) * (v - guess)).square().sum(-1)
+        return -((angle.cos() + angle.sin()) * (v - guess)).square()
 
 
 class ODEDensity(NamedTuple):
@@ -439,8 +436,8 @@ class ODEDensity(NamedTuple):
 class DenoisingDistribution(TorchDistribution):
     """Distribution of values that a denoiser generates: batch shape (...), event shape (D,).
 
-    If all steps are drawn jointly, the batch shape is (B, T), and `log_prob` returns additive shares of one bound for
-    all steps, not conditional densities.
+    If all steps are drawn jointly, the batch shape is (B, T, D), and `log_prob` returns additive shares of one bound
+    for all entries, not conditional densities.
 
     Args:
         module: module of the distribution.
@@ -448,12 +445,18 @@ class DenoisingDistribution(TorchDistribution):
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    support = constraints.real_vector
     has_rsample = True
 
     def __init__(self, module: DenoisingModule, parameters: Parameters):
         self.module, self.parameters = module, parameters
-        super().__init__(parameters[0].shape[:-1], parameters[0].shape[-1:], validate_args=False)
+        shape = parameters[0].shape
+        end = len(shape) - module.event_dim
+        super().__init__(shape[:end], shape[end:], validate_args=False)
+
+    @constraints.dependent_property(is_discrete=False)
+    def support(self) -> constraints.Constraint:
+        """Real vectors, or real numbers if all steps are drawn jointly."""
+        return constraints.independent(constraints.real, self.module.event_dim)
 
     def _shifted_range(self) -> tuple[Tensor, Tensor]:
         """Return the lowest and highest angle of the cosine schedule without its shift."""
@@ -466,9 +469,10 @@ class DenoisingDistribution(TorchDistribution):
         return self.module.density
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return what `density` declares, (...), for values (..., D); random."""
+        """Return what `density` declares, of the batch shape, for values (..., D); random."""
         shape = torch.broadcast_shapes(value.shape, self.batch_shape + self.event_shape)
-        return self.module.score(self._expanded(shape[:-1]), value.expand(shape))
+        entries = self.module.score(self._expanded(shape[:-1]), value.expand(shape))
+        return entries.sum(-1) if self.module.event_dim else entries
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Return draws (*sample_shape, *batch_shape, D), differentiable with respect to the parameters."""
@@ -496,7 +500,8 @@ class DenoisingDistribution(TorchDistribution):
 
     def expand(self, batch_shape: Any, _instance: object = None) -> DenoisingDistribution:
         """Return the distribution with another batch shape."""
-        return DenoisingDistribution(self.module, self._expanded(torch.Size(batch_shape)))
+        shape = torch.Size(batch_shape) + self.event_shape
+        return DenoisingDistribution(self.module, self._expanded(shape[:-1]))
 
     def _expanded(self, batch_shape: torch.Size) -> Parameters:
         return tuple(each.expand(*batch_shape, each.shape[-1]) for each in self.parameters)

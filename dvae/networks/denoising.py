@@ -72,7 +72,7 @@ class Denoiser(DenoiserSpec):
 class SequenceDenoiser(nn.Module):
     """A network over time from noisy values, the level and features to estimates of v at all steps.
 
-    A frame of its input consists of the noisy value, the features, and an indicator of an observed step.
+    A frame of its input consists of the noisy value, the features, and an indicator of each observed entry.
 
     Args:
         spec: description of the denoiser.
@@ -82,18 +82,19 @@ class SequenceDenoiser(nn.Module):
     def __init__(self, spec: Denoiser, shape: Shape):
         super().__init__()
         self.basis, self.coefficients = spec.basis and BASES[spec.basis], spec.coefficients
-        frame = Input("frame", shape.size + shape.features + 1, shape.relation)
+        frame = Input("frame", 2 * shape.size + shape.features, shape.relation)
         self.network = spec.network.build([frame, Input("level", LEVEL_SIZE)], True, shape.size)
         self.out = small_linear(self.network.features, shape.size)
         if self.basis:
             self.log_scale = nn.Parameter(torch.zeros(shape.size))
             self.slope = nn.Parameter(torch.ones(shape.size))
 
-    def forward(self, z: Tensor, angle: Tensor, features: Tensor, steps: Tensor) -> Tensor:
-        """Return v (..., T, D) for z (..., T, D), angles (..., 1, 1), features (..., T, H) and steps (..., T, 1)."""
-        observed, others = torch.where(steps > 0, z, 0.0), torch.cat([features, (steps > 0).to(z.dtype)], -1)
-        others = torch.where(steps < 0, 0.0, others).flatten(0, -3)
-        lengths, observed = (steps >= 0).sum((-2, -1)).flatten(), observed.flatten(0, -3)
+    def forward(self, z: Tensor, angle: Tensor, features: Tensor, entries: Tensor) -> Tensor:
+        """Return v (..., T, D) for z (..., T, D), angles (..., 1, 1), features (..., T, H) and entries (..., T, D)."""
+        observed, others = torch.where(entries > 0, z, 0.0), torch.cat([features, (entries > 0).to(z.dtype)], -1)
+        is_valid = entries[..., :1] >= 0
+        others = torch.where(is_valid, others, 0.0).flatten(0, -3)
+        lengths, observed = is_valid.sum((-2, -1)).flatten(), observed.flatten(0, -3)
         level = embed_level(angle[..., 0, :]).flatten(0, -2)
         if self.basis:
             v = self._in_frequency(observed, angle.flatten(0, -3), others, lengths, level)
