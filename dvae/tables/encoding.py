@@ -315,7 +315,7 @@ class PanelSchema(Schema):
         if any(priors):
             lag = {"changes": 1, "seasonal": self.cut.season or 0}.get(self.target_units, 0)
             views.insert(0, SeriesUnits(priors, lag, self.cut.observed))
-        widths = tuple(column.rounding for column in columns)
+        widths = tuple(float(column.rounding) for column in columns)
         if any(widths):
             views.insert(0, Dequantised(widths))
         return Views(*views) if len(views) > 1 else views[0]
