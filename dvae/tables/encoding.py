@@ -95,9 +95,9 @@ class PanelSchema(Schema):
         calendar: kind, time zone and calendar step of the times.
         priors: dictionary from column to the prior of its level and scale by lag, `SeriesPrior` as a tuple.
         target_units: units of the targets in a model.
-        preferred: units whose reference point is closest to the future in training windows: the mean of the column, the
-            mean of the sequence, its last value or the mean of its seasons; "columns" unless another is twice as close.
-            The default of methods.
+        preferred: units whose reference point is closest to the future in training windows, without the means of their
+            seasons: the mean of the column, the mean of the sequence, or its last value; "columns" unless another is
+            twice as close. The default of methods.
     """
 
     kind: ClassVar[str] = "panel"
@@ -581,14 +581,14 @@ def _prefer(columns: Columns, windows: _TrainingWindows) -> str:
         if column.role != "target" or column.family not in UNITS_OF_SERIES:
             continue
         x = windows.column(index)
-        x = np.log(x) if column.family in POSITIVE else x
-        past, future = np.ma.masked_invalid(x[:, : cut.observed]), np.ma.masked_invalid(x[:, cut.observed :])
+        x = np.ma.masked_invalid(np.log(x) if column.family in POSITIVE else x)
+        if cut.season:  # networks learn seasons from the data
+            means = np.ma.stack([x[:, n : cut.observed : cut.season].mean(1) for n in range(cut.season)], 1)
+            x = x - means[:, np.arange(x.shape[1]) % cut.season] + x[:, : cut.observed].mean(1, keepdims=True)
+        past, future = x[:, : cut.observed], x[:, cut.observed :]
         present = np.maximum.accumulate(np.where(past.mask, -1, np.arange(cut.observed)), 1)[:, -1:]
         last = np.ma.array(np.take_along_axis(x, present.clip(0), 1), mask=present < 0)
         points = {"columns": past.mean(), "series": past.mean(1, keepdims=True), "changes": last}
-        if cut.season:
-            means = [past[:, phase :: cut.season].mean(1) for phase in range(cut.season)]
-            points["seasonal"] = np.ma.stack(means, 1)[:, (cut.observed + np.arange(cut.horizon)) % cut.season]
         errors = {name: float(np.ma.filled(abs(future - point).mean(), np.inf)) for name, point in points.items()}
         for name, error in errors.items():
             totals[name] = totals.get(name, 0.0) + error / (min(errors.values()) or 1.0)
