@@ -16,6 +16,7 @@ from ..data.sequences import RandomMasking, interpolate_missing
 from ..data.views import View
 from ..distributions import (
     FAMILIES,
+    Diffusion,
     DistributionSpec,
     Family,
     FixedNormal,
@@ -222,7 +223,8 @@ class LatentMethod(LikelihoodMethod):
 
     Args:
         prior: distribution of the static latents without parents: "standard" (normal, nothing learned), "mixture" (of
-            normals), "vamp" (mixture of the guide's posteriors of learned pseudo-sequences) or "flow".
+            normals), "vamp" (mixture of the guide's posteriors of learned pseudo-sequences), "flow" or "diffusion"
+            (with a bound in place of its density). `DynamicalVAE.with_prior` trains it in a second stage instead.
         prior_components: number of components of "mixture" and "vamp".
         prior_steps: length of the pseudo-sequences of "vamp"; at most the length of the training windows.
         warm_up: steps over which the KL weight rises from 0 to 1.
@@ -233,7 +235,7 @@ class LatentMethod(LikelihoodMethod):
     """
 
     latent: Size = 16
-    prior: Literal["standard", "mixture", "vamp", "flow"] = "standard"
+    prior: Literal["standard", "mixture", "vamp", "flow", "diffusion"] = "standard"
     prior_components: Annotated[int, Range(1, 1024)] = 16
     prior_steps: Annotated[int, Range(1, 1024)] = 16
     warm_up: Delay | None = 500
@@ -260,6 +262,7 @@ class LatentMethod(LikelihoodMethod):
             "mixture": Mixture(self.prior_components),
             "vamp": Vamp(self.prior_components, self.prior_steps),
             "flow": Flow(),
+            "diffusion": Diffusion(),
         }
         p, q = self.equations()
         latents = [f.child for f in p.factors if f.child in q.variables and not (f.local or f.parents)]

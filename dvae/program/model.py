@@ -7,6 +7,7 @@ the same program with different given values.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -282,6 +283,47 @@ class DynamicalVAE(nn.Module):
         for conditional in (*self.generator.values(), *self.encoder.values()):
             conditional.units[name] = self.units[name]
         return self.units[name]
+
+    @serialized
+    @torch.inference_mode(False)
+    def with_prior(self, distributions: Mapping[str, DistributionSpec]) -> DynamicalVAE:
+        """Return a copy with new distributions of latents and all other parameters frozen, for a second stage.
+
+        Fitting the copy trains the new distributions on draws of the guide. With a `Diffusion`, the copy is a latent
+        diffusion model (Rombach et al., 2022, arXiv 2112.10752). The frozen parameters have `requires_grad` False.
+
+        Args:
+            distributions: dictionary from generative factor of a latent, such as "p(w)", to its new distribution. If
+                the factor has a network, it has the same description as before and new weights.
+
+        Raises:
+            ValueError: if a key is not a factor of a latent, the guide is the prior, or a distribution does not fit.
+
+        Example:
+            >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3})
+            >>> x = torch.randn(8, 5, 3)
+            >>> first = dvae.fit(model, x, steps=3, progress=False)
+            >>> second = model.with_prior({"p(w)": dvae.distributions.Diffusion()})
+            >>> dvae.fit(second, x, steps=3, progress=False).status
+            'finished'
+        """
+        names = {f"p({name})": name for name in self.latents}
+        if not distributions or set(distributions) - set(names):
+            raise ValueError(
+                f"got distributions of {', '.join(distributions) or 'nothing'}; expected factors of latents, which are "
+                f"{', '.join(names) or 'missing in this model'}"
+            )
+        if "encoder" not in self._modules:
+            raise ValueError("the guide is the prior, so a new prior would replace both; give the model a guide")
+        model = copy.deepcopy(self).requires_grad_(False)
+        model._name = f"dvae{next(_COUNT)}"
+        model.distributions = {**self.distributions, **distributions}
+        added = model._conditionals([model.generative.factor(names[key]) for key in distributions], model.encoder)
+        for conditional in added.values():
+            conditional.units.update(model.units.items())
+        model.generator.update(added.to(like(self)))
+        model._check_latents()
+        return model.train(self.training)
 
     def extra_repr(self) -> str:
         """Return the two equations, for the text of the model."""

@@ -362,7 +362,10 @@ def require_densities(model: DynamicalVAE) -> None:
 def bound_notes(label: str, model: DynamicalVAE) -> Iterator[str]:
     """Yield a note for tables if a variable of the model has a stochastic bound in place of a density."""
     if model.bounded:
-        yield f"bounds of {label}: {', '.join(model.bounded)} has a stochastic lower bound in place of a log density"
+        yield (
+            f"bounds of {label}: {', '.join(model.bounded)} has a stochastic lower bound in place of a log density, "
+            "without importance weights (K = 1) and k-hat"
+        )
 
 
 def require_latents(model: DynamicalVAE) -> None:
@@ -440,13 +443,13 @@ def iwae_bound(
     """
     if particles < 1:
         raise ValueError(f"particles must be at least 1, got {particles}")
-    (require_densities if model.latents and particles > 1 else require_likelihood)(model)
+    (require_densities if particles > 1 else require_likelihood)(model)
     with model.running():
         data = model.read(batch)
         size = next(v.shape[0] for v in data.values() if isinstance(v, Tensor))
         if not model.latents:
             evidence = _log_weights(model, data, options)
-            return IWAEBound(evidence, torch.zeros_like(evidence), particles)
+            return IWAEBound(evidence, torch.full_like(evidence, math.nan if model.bounded else 0.0), particles)
         groups = Groups.of(data.group) if model.grouped and data.group is not None else None
         weights = partial(_repeated_weights, model, data, options)
         return importance_mean(weights, size, particles, chunk, groups)

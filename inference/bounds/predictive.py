@@ -16,18 +16,25 @@ score, less so with more particles, and not at all if both guides are posteriors
 
 With missing entries, it is the density of the observed entries of x_{O+1:T}, given the observed ones of x_{1:O}. A
 model that reads its own past reads its means at missing entries, as in the bounds.
+
+If the model is one factor with a `distributions.Diffusion`, the score is its density by the probability-flow ODE, and
+not a bound.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
 from pyro import poutine
 from torch import Tensor
 
+from ...data.batch import Batch
+from ...distributions.diffusion import DiffusionModule
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
+from ...program.rollout import Sequence
 from .elbo import IWAEBound, importance_mean, log_densities, require_densities, sites_of, total
 
 
@@ -45,13 +52,15 @@ def predictive_bound(
         chunk: largest number of sequences times particles in memory.
 
     Returns:
-        The bound in nats per sequence, and the tail shape of the weights, (B,) each.
+        The bound in nats per sequence, and the tail shape of the weights, (B,) each; NaN for a density by the ODE.
 
     Raises:
         ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no step is
             left to observe or to predict.
     """
-    require_densities(model)
+    is_diffusion = _is_one_diffusion(model)
+    if not is_diffusion:
+        require_densities(model)
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
         raise ValueError(
             f"{type(model).__name__} has a custom forecast, whose density is not known; omit the log score"
@@ -95,5 +104,29 @@ def predictive_bound(
             future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
             return total(future) + total(log_densities(past_guide)) - total(log_densities(proposed))
 
-        result = importance_mean(log_weights, size, particles, chunk)
+        if is_diffusion:
+            density = _ode_density(model, data, observed)
+            result = IWAEBound(density, torch.full_like(density, math.nan), particles)
+        else:
+            result = importance_mean(log_weights, size, particles, chunk)
         return replace(result, bound=result.bound + log_det[:, observed:].sum(1).to(result.bound))
+
+
+def _is_one_diffusion(model: DynamicalVAE) -> bool:
+    """Return whether the model is one local factor with a `Diffusion` whose draws follow its density."""
+    first, *others = model.generator.values()
+    is_alone = not others and first.factor.local and first.offset is None
+    return is_alone and isinstance(first.head, DiffusionModule) and first.head.spec.guidance == 1
+
+
+def _ode_density(model: DynamicalVAE, data: Batch, observed: int) -> Tensor:
+    """Return the log density of the steps after `observed`, (B,)."""
+    (name,), run = model.observed, model.rollout(data)
+    if model.generator[name].joint and observed:
+        raise ValueError(
+            f"{model.generator[name].factor} has one density of all steps, not of the future given the past; make the "
+            "past context (dvae.data.views.Past), or omit the log score"
+        )
+    value = run.values[name]
+    density: Tensor = run.evaluate(name, value).exact_log_prob(value).log_prob
+    return density if density.dim() == 1 else Sequence(run, name).counted(density)[:, observed:].sum(1)

@@ -24,6 +24,7 @@ import pyro.distributions as dist
 import torch
 from pyro import poutine
 from torch import Tensor
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from ...locking import seeded, serialized
 from ...options import Count, Delay, Positive, Size, check
@@ -220,7 +221,8 @@ def posterior(
     descent = descent or Descent()
     size, at_once = len(_some(batch)), max(1, chunk // descent.starts)
     device = _some(batch).device
-    with seeded(seed, device), pyro.validation_enabled(False), progress_bar(progress) as bar:
+    attention = sdpa_kernel(SDPBackend.MATH)  # the only kernel of attention with second derivatives
+    with seeded(seed, device), pyro.validation_enabled(False), attention, progress_bar(progress) as bar:
         chunks = [rows(batch, slice(first, first + at_once)) for first in range(0, size, at_once)]
         task = bar.add_task("searching for modes", total=len(chunks) * (descent.steps + descent.newton + 1))
         parts = [_Search(program, chunk, guide, descent, renew, partial(bar.advance, task)).run() for chunk in chunks]
@@ -291,6 +293,12 @@ class _Search:
             for name, site in nodes.items()
             if site["type"] == "sample" and not site["is_observed"] and not poutine.util.site_is_subsample(site)
         }
+        runs = {name: site["infer"]["run"] for name, site in nodes.items() if "run" in (site.get("infer") or {})}
+        if rough := [name for name, run in runs.items() if run.conditionals[name].head.density != "exact"]:
+            raise ValueError(
+                f"{', '.join(rough)} has a random bound or loss in place of a density, so its program has no energy "
+                "with a mode; use the draws of a guide"
+            )
         if not self.latents:
             raise ValueError(
                 "the program has no latents, because all its sites are observed; leave latents out of the batch"

@@ -21,6 +21,7 @@ from pyro import poutine
 from pyro.infer.mcmc import MCMC, NUTS
 from torch import Tensor, nn
 from torch.func import functional_call
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from ...data.batch import Batch
 from ...options import Count, Positive, Range, require
@@ -153,7 +154,8 @@ def weight_posterior(
         if not torch.isfinite(energy(start)):
             raise FloatingPointError("the log density is not finite at the model's weights; fit the model first")
         if method == "laplace":
-            mode, root = laplace(energy, start)
+            with sdpa_kernel(SDPBackend.MATH):  # the only kernel of attention with second derivatives
+                mode, root = laplace(energy, start)
             noise = torch.randn(len(mode), chains * draws, dtype=mode.dtype, device=mode.device)
             drawn = mode + torch.linalg.solve_triangular(root.T, noise, upper=True).T
         else:

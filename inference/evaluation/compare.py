@@ -86,7 +86,8 @@ def compare(
             bounds and forecasts of its mixture, with the largest k-hat of its models.
         data: windows (such as `ArrayWindows`), x `(N, T, D)`, or a batch of `N` sequences, which may be ragged.
         scores: scores of forecasts, as in `evaluate`.
-        particles: K of the IWAE bound. k-hat needs 25, and 100 or more to be meaningful for single sequences.
+        particles: K of the IWAE bound. k-hat needs 25, and 100 or more to be meaningful for single sequences. K is 1
+            for all models if one has a bound in place of a density (`distributions.Diffusion`).
         estimates: number of independent IWAE estimates of every sequence, each with K particles. The bound is their
             mean. `Comparison.to_arviz` needs 25 or more.
         filter_particles: K of the FIVO bound (`fivo_bound`); 0 omits it. For a model without a FIVO bound, such as
@@ -142,6 +143,8 @@ def compare(
             f"{', '.join(f'of {quantity} for {label}' for quantity, label in labels.items())}; use evaluate to compare "
             "forecasts"
         )
+    if any(model.bounded for model in labelled.values()):
+        particles = 1  # the same bound for all models
     batch = sequences(data).batch
     sequence_ids = batch.group.tolist() if batch.group is not None else range(length_of(batch))
     keys = [("data", str(n), 0) for n in sequence_ids] if windows is None else cluster_keys(windows)

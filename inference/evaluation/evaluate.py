@@ -78,7 +78,8 @@ def evaluate(
         draw_emission: whether forecasts are draws of x (True) or its means (False). Proper scoring rules assess the
             model's predictive distribution only if x is drawn. None for draws, or for means if a score is published for
             means (`Measure.of_means`); `DynamicalVAE.is_drawn` lists exceptions.
-        bound_particles: number of particles of the IWAE bound and its k-hat; 0 omits both.
+        bound_particles: number of particles of the IWAE bound and its k-hat; 0 omits both. Models with a bound in place
+            of a density (`distributions.Diffusion`) have neither, and their ELBO is the mean of as many draws.
         log_score_particles: number of particles of the log score (`predictive_bound`); 0 omits it.
         references: whether to add all available reference rows; or the names of some (`References`).
         training_windows: training data of the reference rows, such as x (N, T, D); by default the training part of a
@@ -286,15 +287,16 @@ class _Evaluator:
 
     def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
         """Return bounds, KL terms and k-hat by name, in nats per step, for each cluster."""
-        results = []
+        results, weighted = [], self.bound_particles > 0 and not getattr(model, "bounded", ())
+        elbo = SequenceELBO(1 if weighted else max(self.bound_particles, 1))
         for part in parts:
             batch = on_device_of(model, self.eval_windows.part(part))
-            terms = SequenceELBO().terms(model, batch)
+            terms = elbo.terms(model, batch)
             scores = {"ELBO": terms.per_step}
             scores |= {f"KL {latent}": kl / terms.n_steps for latent, kl in terms.kl.items()}
-            if self.bound_particles:
-                weighted = iwae_bound(model, batch, particles=self.bound_particles)
-                scores |= {"IWAE bound": weighted.bound / terms.n_steps, "k-hat": weighted.khat}
+            if weighted:
+                iwae = iwae_bound(model, batch, particles=self.bound_particles)
+                scores |= {"IWAE bound": iwae.bound / terms.n_steps, "k-hat": iwae.khat}
             refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.eval_windows.keys[part])
             results.append({metric: values.cpu() for metric, values in scores.items()})
         return self._means(_concatenate(results))

@@ -8,6 +8,7 @@ from torch.distributions import MultivariateNormal
 
 import dvae
 from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
+from dvae.inference.bounds.predictive import predictive_bound
 from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
 from dvae.networks.denoising import BASES
 from dvae.testing import FactorizationContract
@@ -212,8 +213,10 @@ class OneDistributionOfAllSteps(FactorizationContract):
 
     def test_every_size_may_be_one(self):
         model = self._model(1)
-        assert model.log_joint({"x": torch.randn(1, 1, 1)}, {"w": torch.randn(1, 1).double()})["x"].isfinite()
-        assert model.sample(1, length=1)["x"].isfinite().all()
+        data = self._data(model, 1, 1)
+        assert dvae.SequenceELBO().terms(model, data).bound.isfinite().all()
+        context = {name: data[name] for name in model.context}
+        assert model.sample(1, length=1, batch=context)["x"].isfinite().all()
 
     def test_a_bound_stays_on_its_device(self):
         """As in the contract, with draws in place of a forecast given past steps."""
@@ -226,7 +229,7 @@ class OneDistributionOfAllSteps(FactorizationContract):
                 traffic.clear()
                 dvae.SequenceELBO().terms(model, device_data).bound.sum().backward()
             assert not traffic.uploads
-            model.sample(2, length=4)
+            model.sample(batch={name: device_data[name] for name in model.context}, length=4)
 
     def test_training_stays_finite(self):
         pytest.skip("this test forecasts given past steps, which a distribution of all steps does not support")
@@ -266,12 +269,24 @@ def test_coefficients_that_the_network_does_not_change_are_independent_normal_va
 
 
 class TestItsEmissionIsOneDiffusion(OneDistributionOfAllSteps):
-    """p(w) p(x_{1:T} | w)."""
+    """p(w) p(x_{1:T} | w, h)."""
+
+    missing = {}  # noqa: RUF012
 
     def build(self, size):
-        pair = "p(w) p(x_{1:T} | w)", "q(w | x_{1:T})"
+        pair = "p(w) p(x_{1:T} | w, h)", "q(w | x_{1:T}, h)"
         distributions = {"p(x)": self.spec}
-        sizes = {"w": size, "x": size}
+        sizes = {"w": size, "x": size, "h": size}
+        return freeze(dvae.DynamicalVAE(*pair, sizes, network=Recurrent(width=5), distributions=distributions))
+
+
+class TestItsLatentsAreOneDiffusion(OneDistributionOfAllSteps):
+    """A prior of all steps of a latent, given a static latent with a prior of its own."""
+
+    def build(self, size):
+        pair = "p(w) p(z_{1:T} | w) p(x_t | z_t)", "q(w | x_{1:T}) q(z_t | z_{t-1}, x_{t:T}, w)"
+        distributions = {"p(w)": Diffusion(hidden=(4,), steps=3), "p(z)": self.spec}
+        sizes = {"w": size, "z": size, "x": size}
         return freeze(dvae.DynamicalVAE(*pair, sizes, network=Recurrent(width=5), distributions=distributions))
 
 
@@ -340,12 +355,46 @@ def test_a_predictor_forecasts_whole_futures():
         "p(w) p(x_{1:T} | w, s)", "q(w | x_{1:T}, s)", {"w": 1, "x": 2, "s": 6}, distributions={"p(x)": spec}, view=view
     )
     windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=3)
-    result = dvae.evaluate(latent, windows, samples=3, progress=False)
-    assert any("stochastic lower bound" in note for note in result.notes)
+    for each in (model, latent):
+        with pytest.raises(ValueError, match="stochastic lower bound"):
+            dvae.iwae_bound(each, torch.randn(4, 8, 2))
+    plain = dvae.DynamicalVAE("p(x_t | s)", "", {"x": 2, "s": 6}, view=view)
+    models = {"model": freeze(model), "latent": latent, "plain": plain}
+    scores = dvae.evaluate(models, windows, samples=3, bound_particles=4, progress=False)
+    assert {name for name in models if "IWAE bound" in scores[name]} == {"plain"}
+    assert {name for name in models if "k-hat" in scores[name]} == {"plain"}
+    result = dvae.compare(models, windows, particles=4, contrasts=0, samples=2, progress=False)
+    assert result.particles == 1
+    for name in models:
+        assert math.isnan(result.rows[name].unreliable) == (name != "plain")
+        assert any("stochastic lower bound" in note for note in result.rows[name].notes) == (name != "plain")
+    assert scores["model"]["ELBO"].mean == pytest.approx(result["model"]["IWAE bound"].mean)
+    assert len([note for note in scores.notes if "stochastic lower bound" in note]) == 2
+
+
+def test_the_log_score_of_one_factor_is_its_density():
+    spec, view = Diffusion(denoiser=JOINT, steps=2), dvae.data.views.Past("s", 3)
+    whole = dvae.DynamicalVAE("p(x_{1:T} | s)", "", {"x": 2, "s": 6}, distributions={"p(x)": spec}, view=view)
+    steps = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2}, distributions={"p(x)": Diffusion(hidden=(4,))})
+    x = torch.randn(4, 8, 2)
+    for model, given in ((whole, {"x": x[:, 3:], "s": x[:, :3].flatten(1)}), (steps, {"x": x})):
+        run = model.rollout(given)
+        density = run.evaluate("x", given["x"]).exact_log_prob(given["x"]).log_prob
+        expected = density if model is whole else density[:, 3:].sum(1)
+        torch.testing.assert_close(predictive_bound(model, x, 3).bound, expected)
+    joint = dvae.DynamicalVAE("p(x_{1:T})", "", {"x": 2}, distributions={"p(x)": spec})
+    with pytest.raises(ValueError, match="make the past context"):
+        predictive_bound(joint, x, 3)
+    guided = Diffusion(hidden=(4,), drop=0.1, guidance=2.0)
     with pytest.raises(ValueError, match="stochastic lower bound"):
-        dvae.iwae_bound(latent, torch.randn(4, 8, 2))
-    result = dvae.compare({"latent": latent}, windows, particles=1, contrasts=0, samples=2, progress=False)
-    assert any("stochastic lower bound" in note for note in result.rows["latent"].notes)
+        predictive_bound(dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2}, distributions={"p(x)": guided}), x, 3)
+
+
+@pytest.mark.parametrize("spec", [Diffusion(hidden=(4,)), FlowMatching(hidden=(4,))])
+def test_a_random_energy_has_no_mode(spec):
+    model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 1, "x": 2}, distributions={"p(x)": spec})
+    with pytest.raises(ValueError, match="x has a random bound or loss"):
+        dvae.posterior(model.model, {"x": torch.randn(2, 4, 2)})
 
 
 def test_per_step_emissions_forecast_and_impute():

@@ -220,6 +220,7 @@ OPTIONS = [
     {"prior": "mixture", "prior_components": 2},
     {"prior": "vamp", "prior_components": 2, "prior_steps": 4},
     {"prior": "flow"},
+    {"prior": "diffusion"},
     {"warm_up": 0},
     {"warm_up": 2, "warm_up_shape": "cosine"},
     {"warm_up": 2, "warm_up_shape": "logistic"},

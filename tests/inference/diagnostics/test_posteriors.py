@@ -101,6 +101,16 @@ def test_the_best_of_several_starts_is_returned():
     assert not torch.equal(single_start.mode["w"].sign(), tilt.sign())
 
 
+def test_the_energy_of_a_network_with_attention_has_no_slope_at_its_mode():
+    pair = "p(w) p(x_t | x_{<t}, w)", "q(w | x_{1:T})"
+    model = dvae.DynamicalVAE(*pair, {"w": 1, "x": 2}, dvae.networks.Attention(8, 2)).double()
+    batch = {"x": torch.randn(3, 4, 2, dtype=torch.float64)}
+    w = dvae.posterior(model.model, batch, descent=QUICK).mode["w"].requires_grad_()
+    trace = pyro.poutine.trace(pyro.poutine.condition(model.model, {"w": w})).get_trace(batch)
+    slope = torch.autograd.grad(trace.log_prob_sum(), w)[0]
+    torch.testing.assert_close(slope, torch.zeros_like(w), rtol=0, atol=1e-3)
+
+
 def test_unsupported_programs_are_errors():
     batch = {"x": torch.zeros(3, 5, dtype=torch.float64)}
 

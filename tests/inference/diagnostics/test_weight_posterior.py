@@ -11,7 +11,7 @@ import dvae
 from dvae import DynamicalVAE, Oracle, linear_gaussian_surrogate, weight_posterior
 from dvae.distributions import Family, FixedNormal
 from dvae.inference.diagnostics import weight_posterior as module
-from dvae.networks import Dense
+from dvae.networks import Attention, Dense
 
 NOISE, SCALE = 0.5, 0.8
 QUIET = {"progress": False, "scale": SCALE}
@@ -124,6 +124,13 @@ def test_latents_are_drawn_jointly_and_summed_out_latents_are_not():
     assert not any(name.endswith("z") for name in posterior.draws)
     summed = DynamicalVAE("p(k_t | k_{t-1}) p(x_t | k_t)", "", {"k": dvae.Discrete(2), "x": 2}, Dense(()))
     assert weight_posterior(summed, x, "laplace", **few).sampling is None
+
+
+def test_laplace_has_second_derivatives_of_attention():
+    model, x = DynamicalVAE("p(x_t | x_{<t})", "", {"x": 1}, Attention(2, 1, 1)), torch.randn(20, 5, 1)
+    dvae.fit(model, x, steps=50, learning_rate=0.01, progress=False)
+    posterior = weight_posterior(model, x, "laplace", scale=0.1, members=2, progress=False)
+    assert all(value.isfinite().all() for value in posterior.draws.values())
 
 
 def test_unsupported_models_are_refused():
