@@ -6,9 +6,9 @@
     linear    seconds of a training step over T, Recurrent: the exponent of a power law
     segments  segments seen as time-stamped frames over forward kinematics of as many poses, on one core
     filter    a Kalman chain of 10,000 steps in blocks over step by step; filter-step: with its gradients
-    stream    an update of an online filter with 1,600 particles over one step of its networks, without anything else:
-              VRNN, whose guide proposes, and SRNN, whose prior does; memory: the process's peak in 10,000 steps of a
-              stream over its peak in the first 1,000
+    stream    an update of an online filter with K particles over one step of its networks, without anything else: DKF,
+              SRNN, VRNN, whose guide proposes, and exact filters of an HMM and of a linear-Gaussian model; memory: the
+              process's peak in 10,000 steps of a stream over its peak in the first 1,000
     VARIANT   a training step (forward, backward, Adam) at the layer sizes of the public implementation over the
               forward and backward passes of its LSTM layers
 
@@ -34,7 +34,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 import dvae
-from dvae import motion
+from dvae import distributions, motion, networks
 from dvae.data.batch import Batch
 from dvae.distributions import scan
 from dvae.distributions.chain import gaussian_chain
@@ -42,7 +42,10 @@ from dvae.distributions.kalman import LinearGaussianChain
 from dvae.networks.loop import shift
 
 BATCH, STEPS, SIZE = 32, 125, 48
+STREAMS = [(name, particles) for name in ("dkf", "srnn", "vrnn") for particles in (100, 1000)]
+STREAMS += [("hmm", 1), ("linear-gaussian", 1)]
 TARGETS = {
+    **{f"stream-{name}-{particles}": ("at most", 3.0) for name, particles in STREAMS},
     "program": ("at most", 1.15),
     "chain": ("at least", 1.0),
     "cache": ("at least", 8.0),
@@ -50,8 +53,6 @@ TARGETS = {
     "segments": ("at most", 3.0),
     "filter": ("at most", 0.1),
     "filter-step": ("at most", 0.1),
-    "stream-vrnn": ("at most", 3.0),
-    "stream-srnn": ("at most", 3.0),
     "stream-memory": ("under", 1.02),
     "srnn": ("at most", 1.6),
     "dsae": ("at most", 1.35),
@@ -331,23 +332,37 @@ def filters(device: torch.device, steps: int = 10_000, batch: int = 1, size: int
     return each[0][0] / each[0][1], each[1][0] / each[1][1]
 
 
-def update(name: str, x: Tensor) -> float:
-    """Return the time of an update of an online filter over one step of the networks of its particles.
+def update(name: str, particles: int, x: Tensor) -> float:
+    """Return the time of an update of an online filter over one step of its networks, for all particles.
 
     Args:
-        name: name of the method.
+        name: name of a method, or of a model with an exact filter, "hmm" or "linear-gaussian".
+        particles: number of particles; 1 for an exact filter.
         x: data (B, D) of a step.
     """
-    model = dvae.method(name, **FAMILY[name]).build({"x": x.shape[1]}).to(x.device).eval()
-    stream = model.filter(x[:, None].expand(-1, 4, -1), 1600 // len(x), seed=0)
-    engine = stream.engine
+    if name in FAMILY:
+        model = dvae.method(name, **FAMILY[name]).build({"x": x.shape[1]})
+    elif name == "hmm":
+        sizes = {"k": dvae.Discrete(5), "x": x.shape[1]}
+        model = dvae.DynamicalVAE("p(k_t | k_{t-1}) p(x_t | x_{t-1}, k_t)", "", sizes)
+    else:
+        sizes, network = {"z": 4, "x": x.shape[1]}, networks.Dense(())
+        pair = "p(z_t | z_{t-1}) p(x_t | z_t)", None
+        model = dvae.DynamicalVAE(*pair, sizes, network, distributions.FixedNormal(0.5))
+    model = model.to(x.device).eval()
+    stream = model.filter(x[:, None].expand(-1, 4, -1), particles if name in FAMILY else None, seed=0)
+    engine, values = stream.engine, {"x": x[:, None], "z": x[:, None, :4]}
 
     @torch.no_grad()
-    def networks() -> None:
+    def step() -> None:
+        if name == "linear-gaussian":
+            for part in model.generator.values():
+                part(values, len(x), 1)
+            return
         for each in (*engine.guide.values(), *engine.prior.values()):
             each.step(engine.position, engine.data | engine.paths)
 
-    a, b = seconds(lambda: stream.update(x), networks)
+    a, b = seconds(lambda: stream.update(x), step, repeat=200)
     return a / b
 
 
@@ -379,5 +394,6 @@ def rows(device: torch.device) -> dict[str, float]:
         numbers["segments"] = segments()
         numbers["stream-memory"] = stream_memory()
     numbers["filter"], numbers["filter-step"] = filters(device)
-    numbers |= {f"stream-{name}": update(name, x[:16, 0]) for name in ("vrnn", "srnn")}
+    for name, particles in STREAMS:
+        numbers[f"stream-{name}-{particles}"] = update(name, particles, x[:1, 0])
     return numbers | {name: member(name, x) for name in FAMILY}

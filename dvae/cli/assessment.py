@@ -520,6 +520,8 @@ def compare(
         out: JSON file for the comparison.
         figure: save bounds, differences, k-hat, and KL over time.
     """
+    if samples == 0:
+        raise UsageError("--samples must be at least 1, got 0; use --no-forecasts to compare without forecasts")
     at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
     at_least(0, contrasts=contrasts, filter_particles=filter_particles)
     check_files(out, figure, ".json")

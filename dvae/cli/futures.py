@@ -153,7 +153,7 @@ def forecast(
     dropped = f"; relative to the root: the protocol {protocol.name} removes the root's path"
     ERROR.print(
         f"wrote {out}: {description} of {frames} frames for each of {len(selected)} windows{context}, "
-        f"{EMISSIONS[futures.emission]}{dropped if protocol.root == 'drop' else ''}"
+        f"{EMISSIONS[futures.emission]}{_blended(written)}{dropped if protocol.root == 'drop' else ''}"
     )
     ERROR.print(f"largest step of a joint to the first future frame: {_steps(written, unblended, 1)}")
     if blend:  # with the step after them, which has the jump if they are few
@@ -532,7 +532,13 @@ def _fastest_window(positions: np.ndarray, window: int | None) -> int:
 
 def _title(futures: motion.Forecasts) -> str:
     split, clip, start = futures.keys[0]
-    return f"{split}/{clip} from frame {start}: {len(futures.forecasts)} futures, {EMISSIONS[futures.emission]}"
+    count = len(futures.forecasts)
+    return f"{split}/{clip} from frame {start}: {count} futures, {EMISSIONS[futures.emission]}{_blended(futures)}"
+
+
+def _blended(futures: motion.Forecasts) -> str:
+    """Return a label of blended futures, "" for others."""
+    return f", first {futures.blend} frames blended with the observed ones" if futures.blend else ""
 
 
 @styled

@@ -142,11 +142,12 @@ class Forecasts:
     def motion(self) -> MotionSet:
         """Return one clip per future, including its observed frames.
 
-        Clips are named after their window and the index of the sample.
+        Clips are named after their window and the index of the sample, and after blending.
         """
+        end = "-blended" if self.blend else ""
         return MotionSet(
             [
-                Clip(split, f"{clip}-{start}-{sample}".replace("/", "-"), np.concatenate([before, future]))
+                Clip(split, f"{clip}-{start}-{sample}{end}".replace("/", "-"), np.concatenate([before, future]))
                 for (split, clip, start), before, futures in zip(
                     self.keys, self.observed, self.forecasts.swapaxes(0, 1), strict=True
                 )

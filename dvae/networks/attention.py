@@ -23,7 +23,7 @@ from ..factorization.relations import Relation
 from .base import ACTIVATIONS, Hoisted, Input, Join, Network, aligned, part
 from .cosine import positions
 from .extract import Extract, Extractors
-from .loop import Rows, each_at, select, valid_steps
+from .loop import Rows, each_at, pick, select, valid_steps
 
 
 @dataclass(frozen=True)
@@ -529,13 +529,13 @@ class Cache:
             self.buffer[:, index] = token
         self.tokens = self.buffer[:, : self.tokens.shape[1] + len(tokens)]
 
-    def select(self, rows: Tensor) -> Cache:
+    def select(self, rows: Tensor | None) -> Cache:
         """Return the cache of the batch rows with indices (N,)."""
         selected = copy.copy(self)
         if self.buffer is None:
-            selected.tokens = self.tokens.index_select(0, rows)
+            selected.tokens = pick(self.tokens, rows)
         else:
-            selected.buffer = self.buffer.index_select(0, rows)
+            selected.buffer = self.buffer.clone() if rows is None else self.buffer.index_select(0, rows)
             selected.tokens = selected.buffer[:, : self.tokens.shape[1]]
         return selected
 
@@ -565,10 +565,12 @@ class Attending:
     rows: Tensor | None = None
     """Rows of the bias, which is not copied when rows are selected."""
 
-    def select(self, rows: Tensor) -> Attending:
+    def select(self, rows: Tensor | None) -> Attending:
         """Return the state of the batch rows with indices (N,)."""
         selected = {name: select(getattr(self, name), rows) for name in ("queries", "cache", "extracted", "lengths")}
         masks, seen = self.masks.copy(), list(self.seen)
+        if rows is None:
+            return replace(self, **selected, masks=masks, seen=seen)
         rows = rows if self.rows is None else self.rows.index_select(0, rows)
         return replace(self, **selected, batch=len(rows), masks=masks, seen=seen, rows=rows)
 

@@ -162,12 +162,12 @@ class Network(nn.Module):
             name = type(self).__name__.removesuffix("Network")
             raise ValueError(f"{name} needs sequences of equal length, but this batch is ragged; split it by length")
 
-    def select(self, state: Any, rows: Tensor) -> Any:
+    def select(self, state: Any, rows: Tensor | None) -> Any:
         """Return the state for some batch rows, which may repeat.
 
         Args:
             state: state from `start` or `step`.
-            rows: indices (N,) of the rows.
+            rows: indices (N,) of the rows; None for a copy of the state, whose steps do not change the state.
         """
         return select(state, rows)
 
@@ -271,8 +271,10 @@ class Hoisted:
         """A tensor with the current batch size, dtype and device of the loop; `select` may change the batch size."""
         return self.base if self.rows is None else self.base.new_empty(()).expand(len(self.rows), 1)
 
-    def select(self, rows: Tensor) -> Hoisted:
+    def select(self, rows: Tensor | None) -> Hoisted:
         """Return the results for the batch rows with indices (N,), without a copy of the base."""
+        if rows is None:
+            return self
         selected = Hoisted(self.base, self.weights, self.known, rows)
         selected.steps = select(self.steps, rows)
         return selected

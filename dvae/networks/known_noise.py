@@ -112,6 +112,6 @@ class WithNoiseNetwork(Network):
         return torch.cat([features, scales[t]], -1), (inner, scales)
 
     @override
-    def select(self, state: Any, rows: Tensor) -> Any:
+    def select(self, state: Any, rows: Tensor | None) -> Any:
         inner, scales = state
         return self.inner.select(inner, rows), select(scales, rows)

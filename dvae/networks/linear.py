@@ -112,6 +112,6 @@ class LinearNetwork(Network):
         return features, state
 
     @override
-    def select(self, state: Any, rows: Tensor) -> Any:
+    def select(self, state: Any, rows: Tensor | None) -> Any:
         base, live = state
         return select(base, rows), live

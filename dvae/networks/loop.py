@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from copy import copy
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -29,38 +28,35 @@ class Rows(Sequence[Any]):
     def __init__(self, values: Sequence[Any]):
         self.values = list(values)
         self.written = [0] * len(values)
-        self.moves: list[Tensor] = []
+        self.moves: list[Tensor] = []  # of rows since the first value was written
         self.origin: Tensor | None = None  # composition of all moves, which selects hoisted work in one step
-        self.is_history = all(
-            value is None for value in self.values
-        )  # of draws, rather than of work done before a loop
+        # a history of draws has steps without a tensor so far; work done before a loop does not
+        self.is_history = any(value is None for value in self.values)
 
-    def select(self, rows: Tensor) -> Rows:
-        """Return the sequence for the batch rows with indices (N,), without copying any tensor."""
+    def select(self, rows: Tensor | None) -> Rows:
+        """Return the sequence for the batch rows with indices (N,), without copying any tensor; a copy for None."""
         selected = Rows(self.values)
-        selected.written = list(self.written)
-        selected.moves = [*self.moves, rows]
-        selected.origin = rows if self.origin is None else self.origin.index_select(0, rows)
-        selected.is_history = self.is_history
+        selected.written, selected.is_history = list(self.written), self.is_history
+        selected.moves, selected.origin = list(self.moves), self.origin
+        if rows is not None:
+            selected.moves += [rows] if self.is_history else []
+            selected.origin = rows if self.origin is None else self.origin.index_select(0, rows)
         return selected
 
     def slide(self) -> None:
-        """Forget the first step of a history, whose other steps move forward, and the selections of rows so far."""
-        self.values = [self[t] for t in range(len(self))]
-        if self.is_history:
-            self.values = [*self.values[1:], None]
+        """Forget the first step, and the selections of rows so far; the other steps move forward."""
+        self.values = [*(self[t] for t in range(1, len(self))), None]
         self.written, self.moves, self.origin = [0] * len(self), [], None
 
     def replaced(self, t: int, value: Any) -> Rows:
         """Return a copy with another value at step t."""
-        copied = copy(self)
-        copied.values, copied.written = list(self.values), list(self.written)
+        copied = self.select(None)
         copied[t] = value
         return copied
 
     def __getitem__(self, t: Any) -> Any:
         value, since = self.values[t], self.written[t]
-        if value is None or since == len(self.moves):
+        if value is None or since == len(self.moves) > 0:
             return value
         if since == 0:
             return pick(value, self.origin)
@@ -71,6 +67,8 @@ class Rows(Sequence[Any]):
         return self.values[t]
 
     def __setitem__(self, t: Any, value: Any) -> None:
+        if not self.is_history:  # whose moves are not stored
+            self.values, self.origin = [self[s] for s in range(len(self))], None
         self.values[t], self.written[t] = value, len(self.moves)
 
     def __len__(self) -> int:
@@ -82,12 +80,12 @@ def pick(value: Tensor, rows: Tensor | None) -> Tensor:
     if rows is None:
         return value
     if value.shape[0] == 1 or value.stride(0) == 0:
-        return value[:1].expand(len(rows), *value.shape[1:])
+        return value[:1].expand(rows.shape[0], *value.shape[1:])
     return value.index_select(0, rows)
 
 
-def select(state: Any, rows: Tensor) -> Any:
-    """Return a loop's state for the batch rows with indices (N,), which may repeat.
+def select(state: Any, rows: Tensor | None) -> Any:
+    """Return a loop's state for the batch rows with indices (N,), which may repeat; for None, a copy of the state.
 
     The batch is the first dimension of tensors. Containers and dataclasses are processed recursively, except frozen
     dataclasses, which are specifications. Lists and tuples of tensors are selected step by step when they are read. If
@@ -111,25 +109,24 @@ def select(state: Any, rows: Tensor) -> Any:
     return state
 
 
-def slide(state: Any) -> None:
-    """Forget the first step of all histories in a loop's state, in place (`Rows.slide`).
+def histories(state: Any) -> Iterator[Rows]:
+    """Return the histories of draws in a loop's state.
 
-    A loop without end keeps the last steps alone, and calls `step` with the same position t again and again.
+    A loop without end keeps their last steps alone (`Rows.slide`), and calls `step` with the same position t again and
+    again.
     """
-    if isinstance(state, Rows):
-        state.slide()
-        return
     kind = type(state)
-    if kind in (list, tuple):
-        parts = state
-    elif kind is dict:
-        parts = state.values()
-    elif is_dataclass(kind) and not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-        parts = vars(state).values()
-    else:
+    if kind is Rows:
+        yield from [state] if state.is_history else []
         return
-    for part in parts:
-        slide(part)
+    if kind is dict:
+        state = state.values()
+    elif is_dataclass(kind) and not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        state = vars(state).values()
+    elif kind not in (list, tuple):
+        return
+    for part in state:
+        yield from histories(part)
 
 
 Computed = TypeVar("Computed")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -236,7 +236,7 @@ class MemoryState:
         """The base (B, H) of each step, or a single base for all steps."""
         return self.base.unbind(1)
 
-    def select(self, rows: Tensor) -> MemoryState:
+    def select(self, rows: Tensor | None) -> MemoryState:
         """Return the state of the batch rows with indices (N,), without a copy of the base."""
         selected = MemoryState(self.base, self.live, select(self.lengths, rows), select(self.hidden, rows))
         selected.steps = select(self.steps, rows)
@@ -417,10 +417,10 @@ class RecurrentState:
     given: dict[str, Tensor]
     lengths: Tensor | None
 
-    def select(self, rows: Tensor) -> RecurrentState:
+    def select(self, rows: Tensor | None) -> RecurrentState:
         """Return the state of the batch rows with indices (N,); the given parents are unchanged."""
-        selected = {name: select(getattr(self, name), rows) for name in ("hoisted", "memories", "extracted", "lengths")}
-        return replace(self, **selected)
+        memories, extracted, lengths = (select(each, rows) for each in (self.memories, self.extracted, self.lengths))
+        return RecurrentState(self.hoisted.select(rows), memories, self.live, extracted, self.given, lengths)
 
 
 def tie(first: Any, *others: Any) -> None:

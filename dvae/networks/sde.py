@@ -303,7 +303,7 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
         return _features(*self.updated(decay, whitening, features), last), (transitions, previous, potential)
 
     @override
-    def select(self, state: Any, rows: Tensor) -> Any:
+    def select(self, state: Any, rows: Tensor | None) -> Any:
         transitions, previous, potential = state
         return *select((transitions, previous), rows), None if potential is None else self.potential.select(
             potential, rows

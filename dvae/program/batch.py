@@ -259,7 +259,7 @@ class Reader:
                 raise ValueError(
                     f"{name} has {values[name][tuple(index)].item():g} (sequence {index[0]}, coordinate {index[-1]}),"
                     f" but under {distribution.factor}, {distribution.head.label}, values are "
-                    f"{_describe_support(distribution.support)}; give {name} another"
+                    f"{describe_support(distribution.support)}; give {name} another"
                     " distribution, correct such entries, or hide them by the 'mask' of the batch"
                 )
 
@@ -388,11 +388,11 @@ def check_scale(batch: AnyBatch, names: Collection[str]) -> None:
             raise ValueError(f"the standard deviation of {name} is {largest:g}; {TOO_SMALL}")
 
 
-def _describe_support(support: Any) -> str:
+def describe_support(support: Any) -> str:
     """Return the support in words."""
     if isinstance(support, ProductSupport):
         return "; ".join(
-            f"of {', '.join(map(str, places))}: {_describe_support(part)}" for places, part in support.parts
+            f"of {', '.join(map(str, places))}: {describe_support(part)}" for places, part in support.parts
         )
     while hasattr(support, "base_constraint"):
         support = support.base_constraint

@@ -55,8 +55,12 @@ def evaluating(*modules: nn.Module) -> Iterator[None]:
 
 def like(module: nn.Module) -> Tensor:
     """Return any parameter or buffer of the module, which shows its dtype and device."""
-    for tensor in module.parameters():
-        return tensor
+    parts = [module]
+    while parts:  # `parameters` visits all names, and a filter calls this function at each step
+        part = parts.pop()
+        if tensors := [tensor for tensor in part._parameters.values() if tensor is not None]:
+            return tensors[0]
+        parts += filter(None, part._modules.values())
     return next(module.buffers())
 
 
@@ -286,7 +290,8 @@ class Conditional(nn.Module):
     @property
     def _output_units(self) -> Units | None:
         """Units of the child, if the parameters of its distribution can be transformed to them."""
-        return self.units.get(self.factor.child) if self.head.location_scale else None
+        units = self.units.get(self.factor.child)
+        return None if units is None or not self.head.location_scale else units
 
     def _rescale(self, parameters: Parameters, factors: Tensor | None = None) -> Parameters:
         if parameters and torch.is_autocast_enabled(parameters[0].device.type):
@@ -435,8 +440,8 @@ class Conditional(nn.Module):
                 steps[s] = torch.cat([value, torch.ones_like(value) if masks[s] is None else masks[s].to(value)], -1)
         return steps
 
-    def select(self, state: Any, rows: Tensor) -> Any:
-        """Return the state of a loop for the given rows (N,) of the batch, such as resampled particles."""
+    def select(self, state: Any, rows: Tensor | None) -> Any:
+        """Return the state of a loop for the given rows (N,) of the batch, or a copy for None (`loop.select`)."""
         if self.network is None:
             return select(state, rows)
         if not isinstance(state, Standardised):

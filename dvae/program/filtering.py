@@ -13,9 +13,9 @@ import math
 import os
 import zlib
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, is_dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Annotated, Any, Self
 
 import torch
@@ -36,10 +36,8 @@ from .conditional import Conditional, like
 from .gaussian import GaussianFilter, is_linear_gaussian
 from .particles import (
     Particles,
-    effective_size,
     hidden_data,
     is_windowed,
-    log_mean,
     moments_of_mixture,
     reads_ahead,
     reads_now,
@@ -146,17 +144,27 @@ class Prediction:
         """Variance (B, D) of each data variable, in the model's representation; NaN if a component has no formula."""
         return {name: variance for name, (_, variance) in self.moments.items()}
 
-    @property
+    @cached_property
+    def components(self) -> dict[str, tuple[Any, Tensor]]:
+        """Distribution (C B, D) and weights (C, B, 1) of the components of each data variable."""
+        return {
+            name: (conditional.distribution(parameters), log_weights.exp()[..., None])
+            for name, (conditional, parameters, log_weights) in self.parts.items()
+        }
+
+    @cached_property
     def moments(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Mean and variance (B, D) of each data variable."""
         moments = {}
-        for name, (conditional, parameters, log_weights) in self.parts.items():
+        for name, (distribution, weights) in self.components.items():
+            conditional, parameters, _ = self.parts[name]
             means = conditional.mean(parameters)
-            variances = torch.full_like(means, math.nan)
-            with suppress(NotImplementedError, AttributeError):  # some distributions have no formula
-                variances = conditional.distribution(parameters).variance
-            shape = log_weights.shape
-            moments[name] = moments_of_mixture(means.unflatten(0, shape), variances.unflatten(0, shape), log_weights)
+            try:
+                variances = distribution.variance
+            except (NotImplementedError, AttributeError):  # some distributions have no formula
+                variances = torch.full_like(means, math.nan)
+            shape = *weights.shape[:2], -1
+            moments[name] = moments_of_mixture(means.reshape(shape), variances.reshape(shape), weights)
         return moments
 
     def pit(self, name: str, value: Tensor, uniform: Tensor) -> Tensor:
@@ -167,13 +175,14 @@ class Prediction:
             value: (B, D), in the model's representation.
             uniform: uniform numbers (B, D), which randomise between P(X < x) and P(X <= x).
         """
-        conditional, parameters, log_weights = self.parts[name]
-        values = value.repeat(len(log_weights), 1)
-        below, upto = (
-            (log_weights.softmax(0)[..., None] * bound.unflatten(0, log_weights.shape)).sum(0).to(uniform)
-            for bound in cdf(conditional.distribution(parameters), values)
-        )
-        return below + uniform * (upto - below)
+        distribution, weights = self.components[name]
+        count, batch = weights.shape[:2]
+        below, upto = cdf(distribution, value.expand(count, -1, -1).reshape(count * batch, -1))
+        shares = upto.reshape(count, batch, -1)
+        if below is not upto:
+            below = below.reshape(count, batch, -1)
+            shares = below + uniform * (shares - below)
+        return (weights * shares).sum(0)
 
     def sample(self, samples: int) -> dict[str, Tensor]:
         """Return draws (S, B, D) of each data variable, in the unit of the data.
@@ -204,6 +213,8 @@ class Prediction:
 class Filter:
     """The state of a filter after some steps; `DynamicalVAE.filter` builds it.
 
+    The weights of the model must not change between steps.
+
     Attributes:
         filtered: results of the steps of the last call; there are none after `load`.
         proposal: as in `Filtered`.
@@ -218,8 +229,9 @@ class Filter:
             raise ValueError(f"resample_below must be a share of the particles, from 0 to 1, got {resample_below}")
         self.model, self.lag, self.resample_below, self.steps = model, lag, resample_below, 0
         seed = int(torch.randint(2**62, ())) if seed is None else seed
-        self.module: Any = torch.cuda if like(model).is_cuda else torch
-        with seeded(seed, like(model).device):
+        self.device = like(model).device
+        self.module: Any = torch.cuda if self.device.type == "cuda" else torch
+        with seeded(seed, self.device):
             self.random = self.module.get_rng_state()
         self.uniform = torch.Generator().manual_seed(seed)
         with self._running():
@@ -241,14 +253,14 @@ class Filter:
                 for parent in factor.parents
             )
             self.count = 1 if exact or not is_drawn else particles or PARTICLES
-            self._build(run, exact)
-            self.filtered = self._advance(run, data)
+            self.filtered = self._advance(run, data, self._build(run, exact))
 
     def __repr__(self) -> str:
         proposal = ", ".join(f"{name}: {how}" for name, how in self.proposal.items())
         return f"Filter({self.engine.known.batch} sequences, {self.steps} steps, {self.count} particles, {proposal})"
 
-    def _build(self, run: Rollout, exact: bool) -> None:
+    def _build(self, run: Rollout, exact: bool) -> Tensor:
+        """Build and start the engine; return the log evidence (B,) of static data."""
         model = self.model
         if not self.endless:
             parents = [p for f in (*model.generative.factors, *model.inference.factors) for p in f.parents]
@@ -260,15 +272,20 @@ class Filter:
             self.engine: Any = GaussianFilter(model, run, live=not self.endless)
         else:
             self.engine = Particles(model, run, self.count, self.proposal, live=not self.endless, lag=self.lag)
-        self.engine.start()
+        carried: Tensor = self.engine.start()
+        return carried
 
     @contextmanager
     def _running(self) -> Iterator[None]:
         """Run programs of the model with the random numbers of the filter, which other draws do not change."""
-        with self.model.running(), torch.no_grad(), seeded(None, like(self.model).device):
-            self.module.set_rng_state(self.random)
-            yield
-            self.random = self.module.get_rng_state()
+        with self.model.running(), torch.no_grad():
+            outside = self.module.get_rng_state()
+            try:
+                self.module.set_rng_state(self.random)
+                yield
+                self.random = self.module.get_rng_state()
+            finally:
+                self.module.set_rng_state(outside)
 
     def update(self, batch: AnyBatch) -> Filtered:
         """Continue with new steps, in constant time and memory per step.
@@ -301,7 +318,7 @@ class Filter:
         names = self._context_names
         if other := [name for name in context or {} if name not in names]:
             raise ValueError(f"a prediction reads {', '.join(names) or 'no context'}; leave out {', '.join(other)}")
-        with self._running(), seeded(None, like(self.model).device):
+        with self._running(), seeded(None, self.device):
             engine = self.engine.fork()
             engine.begin(self.resample_below)
             if names:
@@ -326,7 +343,8 @@ class Filter:
         _require_names(data, names)
         return data
 
-    def _advance(self, run: Rollout, data: Batch) -> Filtered:
+    def _advance(self, run: Rollout, data: Batch, carried: Tensor | float = 0.0) -> Filtered:
+        """Filter the steps of a run; `carried` is the log evidence (B,) of the static data before the first step."""
         engine, model, steps = self.engine, self.model, []
         valid = None if run.lengths is None else valid_steps(run.lengths, run.length)
         volume = data.log_det
@@ -340,21 +358,17 @@ class Filter:
         if model.summed:
             model.sums.require_data(hidden_data(run))
         for t in range(run.length):
-            carried = 0.0 if self.steps else log_mean(engine.log_weights)  # of static data
             low = engine.begin(self.resample_below, None if valid is None else valid[:, t])
             if not self.endless:
                 engine.feed(run, t, self._context_names)
             predicted = Prediction(model, engine.predict())
             if not self.endless:
                 engine.feed(run, t, names)
-            before = log_mean(engine.log_weights) - carried
-            engine.weigh()
-            total = log_mean(engine.log_weights)
-            engine.log_weights = torch.where(total > -math.inf, engine.log_weights - total, 0.0)
-            evidence = total - before
+            evidence = engine.weigh() + carried
+            carried = 0.0
             step: dict[str, Any] = {
                 "log_evidence": evidence if volume is None else evidence + volume[:, t],
-                "effective": effective_size(engine.log_weights),
+                "effective": engine.effective,
                 "resampled": low,
             }
             moments = predicted.moments
@@ -372,8 +386,9 @@ class Filter:
                 lagged = engine.summary(self.lag)
                 step |= {f"lagged_{field}": values for field, values in lagged.items()}
             if not isinstance(engine, GaussianFilter) and model.latents:
-                step["particles"] = {n: v.unflatten(0, (self.count, -1)) for n, v in engine.latents().items()}
-                step["log_weights"] = engine.log_weights.log_softmax(0)
+                shape = self.count, run.batch, -1
+                step["particles"] = {name: value.reshape(shape) for name, value in engine.latents().items()}
+                step["log_weights"] = engine.log_weights
             self.steps += 1
             steps.append(step)
         return Filtered.join(steps, valid, max(self.lag - self.steps + run.length, 0), self.proposal)
@@ -411,10 +426,12 @@ class Filter:
         loaded.model, loaded.endless = model, ""
         for name in SETTINGS:
             setattr(loaded, name, settings[name])
-        loaded.module = torch.cuda if like(model).is_cuda else torch
+        loaded.device = like(model).device
+        loaded.module = torch.cuda if loaded.device.type == "cuda" else torch
         loaded.random, loaded.uniform = tensors.pop("random"), torch.Generator()
         loaded.uniform.set_state(tensors.pop("uniform"))
-        tensors = {name: value.to(like(model).device) for name, value in tensors.items()}
+        # copies, because the tensors of a file are not aligned in memory
+        tensors = {name: value.to(loaded.device, copy=True) for name, value in tensors.items()}
         statics = {name.removeprefix("static/"): v for name, v in tensors.items() if name.startswith("static/")}
         empty = {
             n: torch.zeros(settings["batch"], 1, model.sizes[n])
@@ -462,8 +479,12 @@ def _settings(content: bytes, path: Any) -> dict[str, Any]:
 
 def _exchange(state: Any, path: str, tensors: dict[str, Tensor], load: bool) -> Any:
     """Store the tensors of a state by path, or replace them if `load`, in place where possible; return the state."""
-    if isinstance(state, Tensor) or (load and path in tensors):
-        return tensors[path] if load else tensors.setdefault(path, state)
+    if load and (path in tensors or isinstance(state, Tensor)):
+        # equal tensors keep their layout in memory, on which the last bits of sums depend
+        is_equal = isinstance(state, Tensor) and torch.equal(state, tensors[path])
+        return state if is_equal else tensors[path]
+    if isinstance(state, Tensor):
+        return tensors.setdefault(path, state)
     if isinstance(state, Rows):
         parts = {str(t): state[t] for t in range(len(state))}
     elif isinstance(state, list | tuple):

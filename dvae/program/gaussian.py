@@ -13,11 +13,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from ..distributions.base import Parameters
 from ..distributions.families import FixedNormalModule, Gaussian
 from ..networks.linear import LinearNetwork
-from ..networks.loop import Rows, slide
+from ..networks.loop import Rows
 from ..networks.recurrent import RecurrentNetwork
 from .conditional import Conditional, like
 from .rollout import Rollout
@@ -34,10 +35,15 @@ def is_linear_gaussian(model: Any) -> bool:
 
 
 def _is_linear(conditional: Conditional) -> bool:
-    network, head, units = conditional.network, conditional.head, conditional.units
+    units = conditional.units
     has_logarithms = any(units[name].logarithms for name in conditional.parents if name in units)
-    if has_logarithms or conditional.exposure is not None or conditional.offset is not None:
-        return False
+    is_standard = conditional.exposure is None and conditional.offset is None
+    return is_standard and not has_logarithms and is_affine_normal(conditional)
+
+
+def is_affine_normal(conditional: Conditional) -> bool:
+    """Return whether a conditional is a normal with an affine network and a scale that does not depend on parents."""
+    network, head = conditional.network, conditional.head
     if network is None:
         return isinstance(head, Gaussian)
     is_affine = isinstance(network, LinearNetwork)
@@ -58,21 +64,31 @@ class GaussianFilter:
     def __init__(self, model: Any, known: Rollout, live: bool):
         self.model, self.known, self.live = model, known, live
         order = [name for block in model.generative.blocks for name in block.names]
-        self.local = [name for name in order if model.generative.local(name)]
+        read = {parent.name for factor in model.generative.factors for parent in factor.parents}
+        unread = [name for name in model.observed if name not in read]  # forgotten at the end of each step
+        kept = [name for name in order if model.generative.local(name) and name not in unread]
+        self.local = [*kept, *unread]
         self.statics = [name for name in order if not model.generative.local(name)]
         self.sizes = [model.sizes[name] for name in self.local]
+        self.kept = {name: model.sizes[name] for name in kept}
+        self.width = sum(self.kept.values())
         self.context = {n: Rows([None] * known.length) for n in model.context if live and model.reader.local[n]}
+        self.read_context = {name for name in order if self.context.keys() & model.generator[name].parents}
+        self.maps: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+        """Results of `_affine` in the last step of the window of a stream, which does not move any more."""
         self.position = -1
 
-    def start(self) -> None:
-        """Compute the moments of the static latents."""
+    def start(self) -> Tensor:
+        """Compute the moments of the static latents; return the log evidence 0 (B,) before any data."""
         batch = self.known.batch
         self.log_weights = torch.zeros(1, batch, dtype=torch.float64, device=like(self.model).device)
+        self.effective = torch.ones_like(self.log_weights[0])
         self.mean = self.log_weights.new_zeros(batch, 0)
         self.covariance = self.log_weights.new_zeros(batch, 0, 0)
         for name in self.statics:
             self._extend(name, noisy=True)
         self.static_size = self.mean.shape[1]
+        return self.log_weights[0]
 
     def fork(self) -> GaussianFilter:
         """Return a copy whose steps do not change this filter."""
@@ -83,9 +99,12 @@ class GaussianFilter:
     def begin(self, resample_below: float, valid: Tensor | None = None) -> Tensor:
         """Move to the next step."""
         if self.live and self.position == self.known.length - 1:
-            kept = [*range(self.static_size), *range(self.static_size + sum(self.sizes), self.mean.shape[1])]
-            self.mean, self.covariance = self.mean[:, kept], self.covariance[:, kept][:, :, kept]
-            slide(self.context)
+            kept = slice(self.static_size), slice(self.static_size + self.width, None)
+            self.mean = torch.cat([self.mean[:, part] for part in kept], 1)
+            rows = torch.cat([self.covariance[:, part] for part in kept], 1)
+            self.covariance = torch.cat([rows[:, :, part] for part in kept], 2)
+            for values in self.context.values():
+                values.slide()
         self.position = min(self.position + 1, self.known.length - 1)
         return torch.zeros(self.known.batch, dtype=torch.bool, device=self.mean.device)
 
@@ -107,10 +126,11 @@ class GaussianFilter:
             result[name] = self.model.generator[name], moments, torch.zeros_like(self.log_weights)
         return result
 
-    def weigh(self) -> None:
-        """Condition on the data of the step, and add their log density to `log_weights`."""
+    def weigh(self) -> Tensor:
+        """Condition on the data of the step, and return their log density (B,)."""
         if not self.live:
             self.run, self.t = self.known, self.position
+        total = self.log_weights[0]
         for name in self.model.observed:
             part, mask = self._part(name, self.position), self.run.mask(name)
             value = self.run.values[name][:, self.t].double()
@@ -119,17 +139,21 @@ class GaussianFilter:
             spread = spread * observed[:, :, None] * observed[:, None] + torch.diag_embed(1 - observed)
             residual = (value - self.mean[:, part]) * observed
             root = torch.linalg.cholesky(spread)
-            white = torch.linalg.solve_triangular(root, residual[..., None], upper=False)[..., 0]
-            gain = torch.cholesky_solve((self.covariance[:, :, part] * observed[:, None]).mT, root).mT
+            across = self.covariance[:, part] * observed[..., None]
+            solved = torch.linalg.solve_triangular(root, torch.cat([residual[..., None], across], 2), upper=False)
+            white, across = solved[..., 0], solved[..., 1:]
             log_density = -0.5 * white.square().sum(1) - root.diagonal(dim1=1, dim2=2).log().sum(1)
-            self.log_weights = self.log_weights + log_density - 0.5 * math.log(2 * math.pi) * observed.sum(1)
-            self.mean = self.mean + (gain @ residual[..., None])[..., 0]
-            covariance = self.covariance - gain @ spread @ gain.mT
+            total = total + log_density - 0.5 * math.log(2 * math.pi) * observed.sum(1)
+            self.mean = self.mean + (across.mT @ white[..., None])[..., 0]
+            covariance = self.covariance - across.mT @ across
             # the model reads the value where it was observed, and its own mean elsewhere
             self.mean[:, part] = torch.where(observed > 0, value, self.mean[:, part])
             uncertain = torch.ones_like(self.mean)
             uncertain[:, part] = 1 - observed
             self.covariance = (covariance + covariance.mT) / 2 * uncertain[:, :, None] * uncertain[:, None]
+        kept = self.static_size + (self.position + 1) * self.width
+        self.mean, self.covariance = self.mean[:, :kept], self.covariance[:, :kept, :kept]
+        return total
 
     def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
         """Return mean and variance (B, D) of each latent `lag` steps ago, given the data so far."""
@@ -146,23 +170,38 @@ class GaussianFilter:
             first = sum(self.model.sizes[other] for other in self.statics[: self.statics.index(name)])
         else:
             index = self.local.index(name)
-            first = self.static_size + position * sum(self.sizes) + sum(self.sizes[:index])
+            first = self.static_size + position * self.width + sum(self.sizes[:index])
         return slice(first, first + self.model.sizes[name])
 
     def _extend(self, name: str, noisy: bool) -> Tensor:
         """Append a variable at the current step, with or without its noise, and return its noise scale (R, D)."""
+        weights, offset, scale = self.maps[name] if name in self.maps else self._affine(name, self.position + 1)
+        if self.live and self.position == self.known.length - 1 and name not in self.read_context:
+            self.maps[name] = weights, offset, scale
+        mean = (weights @ self.mean[..., None])[..., 0] + offset
+        across = weights @ self.covariance
+        within = across @ weights.mT + (torch.diag_embed(scale.square()) if noisy else 0.0)
+        self.mean = torch.cat([self.mean, mean], 1)
+        self.covariance = torch.cat([torch.cat([self.covariance, across.mT], 2), torch.cat([across, within], 2)], 1)
+        return scale
+
+    def _affine(self, name: str, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return weights (R, D, S), offset and noise scale (R, D) of a variable given the S coordinates so far.
+
+        R is 1, or B if the variable reads context. S includes variables of its own step.
+        """
         conditional, (batch, size) = self.model.generator[name], self.mean.shape
         probes = torch.cat([self.mean.new_zeros(1, size), torch.eye(size).to(self.mean)])
         names = [n for n in conditional.parents if n in self.model.context]
         count = batch if names else 1
-        probes, steps, values = probes.repeat(count, 1).to(like(self.model)), self.position + 1, {}
+        probes, values = probes.repeat(count, 1).to(like(self.model)), {}
         for each in self.statics:
             if conditional.factor.parent(each) is not None:
                 values[each] = probes[:, self._part(each, 0)]
         if conditional.factor.local:
-            rest = probes.new_zeros(len(probes), steps * sum(self.sizes))
-            rest[:, : size - self.static_size] = probes[:, self.static_size :]
-            values |= dict(zip(self.local, rest.unflatten(1, (steps, -1)).split(self.sizes, -1), strict=True))
+            rest = functional.pad(probes[:, self.static_size :], (0, steps * self.width + self.static_size - size))
+            parts = rest.view(-1, steps, self.width).split([*self.kept.values()], -1) if self.kept else ()
+            values |= dict(zip(self.kept, parts, strict=True))
         for each in names:
             value = self.known.values.get(each)
             if value is None:
@@ -174,10 +213,4 @@ class GaussianFilter:
         if conditional.factor.local:
             location, scale = location[:, -1], scale[:, -1]
         location, scale = (part.double().unflatten(0, (count, size + 1)) for part in (location, scale))
-        weights, scale = (location[:, 1:] - location[:, :1]).mT, scale[:, 0]
-        mean = (weights @ self.mean[..., None])[..., 0] + location[:, 0]
-        across = weights @ self.covariance
-        within = across @ weights.mT + (torch.diag_embed(scale.square()) if noisy else 0.0)
-        self.mean = torch.cat([self.mean, mean], 1)
-        self.covariance = torch.cat([torch.cat([self.covariance, across.mT], 2), torch.cat([across, within], 2)], 1)
-        return scale
+        return (location[:, 1:] - location[:, :1]).mT, location[:, 0], scale[:, 0]

@@ -788,12 +788,13 @@ class DynamicalVAE(nn.Module):
             ValueError: if the batch has names that the model does not know, a mask without its variable, or data that
                 the view rejects.
         """
-        if like(self).is_meta:
+        parameter = like(self)
+        if parameter.is_meta:
             raise ValueError(
                 "the model's parameters are on the meta device and have no values; build the model outside of "
                 "`torch.device('meta')`, or call `to_empty(device='cpu')` and load weights"
             )
-        reader = self.reader, like(self).dtype
+        reader = self.reader, parameter.dtype
         if isinstance(batch, Batch) and batch.reader == reader and not precise:
             return batch
         means = {name: units.filling for name, units in self.units.items()}

@@ -22,17 +22,18 @@ import scipy
 import torch
 from torch import Tensor
 
-from ..distributions.families import FixedNormal, FixedNormalModule, Gaussian
+from ..distributions.families import FixedNormal
 from ..distributions.family import Family
 from ..factorization.inversion import FAITHFUL, guide
 from ..factorization.notation import Factor, Factorization
 from ..locking import seeded
 from ..networks.base import indicator
-from ..networks.linear import Linear, LinearNetwork
+from ..networks.linear import Linear
 from ..networks.loop import valid_steps
 from ..options import Count, kind_of, require
 from .conditional import Conditional, like
 from .enumeration import Discrete
+from .gaussian import is_affine_normal
 from .model import DynamicalVAE
 from .rollout import Rollout
 
@@ -110,7 +111,8 @@ class Oracle:
     variable reads padding.
 
     Args:
-        model: a `linear_gaussian_surrogate`, or any `DynamicalVAE` with `networks.Linear` and normals of fixed scale.
+        model: a `linear_gaussian_surrogate`, or any `DynamicalVAE` with networks `Linear` or `Dense(())` and normals of
+            fixed scale.
         steps: T.
 
     Raises:
@@ -227,11 +229,11 @@ class Oracle:
 
     def _require_linear(self, conditional: Conditional) -> None:
         units = self.model.units
-        linear = isinstance(conditional.network, LinearNetwork) and isinstance(conditional.head, FixedNormalModule)
-        if not linear and not (conditional.network is None and isinstance(conditional.head, Gaussian)):
+        if not is_affine_normal(conditional):
             raise ValueError(
-                f"{conditional.factor} is not linear-Gaussian; give it networks.Linear with distributions.FixedNormal, "
-                "as in dvae.linear_gaussian_surrogate, or, if it has no parents, any normal distribution"
+                f"{conditional.factor} is not linear-Gaussian; give it networks.Linear or networks.Dense(()) with "
+                "distributions.FixedNormal, as in dvae.linear_gaussian_surrogate, or, if it has no parents, any normal "
+                "distribution"
             )
         if log_parents := [name for name in conditional.parents if name in units and units[name].logarithms]:
             raise ValueError(

@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from ..distributions.base import Parameters
 from ..factorization.notation import Factor, Parent
 from ..locking import seeded
 from ..networks.base import indicator, presence
-from ..networks.loop import Rows, memoizing, pick, select, slide, valid_steps
+from ..networks.loop import Rows, histories, memoizing, pick, select, valid_steps
 from .conditional import Conditional, like
 from .rollout import Rollout
 
@@ -69,6 +69,7 @@ class Particles:
             for factor in model.generative.factors
         }
         """Variables of the same step that each variable reads."""
+        self.drawn_names = self._local(model.latents)
         self.read_now = {name for names in self.instant.values() for name in names}
         missing = hidden_data(known)
         self.hidden = [
@@ -76,13 +77,15 @@ class Particles:
         ]
         self.shared = {name: value for name, value in known.values.items() if name not in self.hidden}
         self.late = late_statics(model) if proposal is None else set()
-        self.sequence = torch.arange(known.batch, device=like(model).device).repeat(particles)
+        self.log_weights = like(model).new_zeros(particles, known.batch)
+        self.sequence = torch.arange(known.batch, device=self.log_weights.device).repeat(particles)
         self.statics: dict[str, Rows] = {}
-        self.paths = self._slots([*self._local(model.latents), *self.hidden])
+        self.paths = self._slots([*self.drawn_names, *self.hidden])
         if live:
             local = [*self.data_names, *(name for name in model.context if model.reader.local[name])]
-            self.data = self._slots([*local, *map(indicator, local), *map(presence, self._local(model.latents))])
-            self.masks: dict[str, Any] = {name: self._slots([name])[name] for name in self._local(self.order)}
+            names = [*local, *map(indicator, local), *map(presence, self.drawn_names)]
+            self.data: dict[str, Any] = {name: [None] * known.length for name in names}
+            self.masks: dict[str, Any] = {name: [None] * known.length for name in self._local(self.order)}
         else:
             self.data = {name: self._by_step(known.values[name]) for name in self.data_names}
             masks = {name: known.mask(name) for name in self._local(self.order)}
@@ -107,10 +110,10 @@ class Particles:
 
     # The steps ----------------------------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Draw the static latents that precede the steps, and evaluate what is known about all steps."""
+    def start(self) -> Tensor:
+        """Draw the static latents that precede the steps, evaluate what is known about all steps, and `normalise`."""
         model = self.model
-        self.log_weights = self._draw_statics(late=False).view(self.particles, -1)
+        self.log_weights = self._draw_statics(late=False).view(self.particles, -1) - math.log(self.particles)
         with memoizing():
             self.guide = {
                 name: self._stepwise(model.encoder[name], self.known.values)
@@ -123,6 +126,12 @@ class Particles:
         self.past_states = self._slots(["joint", "logs"] if self.lag and model.summed else [])
         self.adopts = not self.guide and not self.read_now & {*self.data_names}
         """Whether predictions and weights need the same draws and network evaluations, as in a bootstrap filter."""
+        return self.normalise()
+
+    def normalise(self) -> Tensor:
+        """Normalise the weights, and return the log of their sum (B,): the log evidence since the last call."""
+        self.log_weights, total, self.effective = normalise(self.log_weights)
+        return total
 
     def begin(self, resample_below: float, valid: Tensor | None = None) -> Tensor:
         """Move to the next step: resample, and draw the noise of the step; return where particles were resampled.
@@ -131,29 +140,35 @@ class Particles:
             resample_below: share of the particles; the effective sample size below which they are resampled.
             valid: (B,), False for sequences that have ended; None if none has.
         """
-        low = effective_size(self.log_weights) < resample_below * self.particles
+        low = self.effective < resample_below * self.particles
         low = low if valid is None else low & valid
         if self.position < 0 and not self.statics:
             low = torch.zeros_like(low)
-        if low.any():
+        if self.particles > 1 and low.any():
             self._select(ancestors(self.log_weights, low))
-            self.log_weights = self.log_weights.masked_fill(low, 0)
+            self.log_weights = self.log_weights.masked_fill(low, -math.log(self.particles))
         if self.position == self.known.length - 1:
-            slide([self.paths, self.data, self.masks, self.guide, self.prior, self.past_states])
+            for values in (*self.data.values(), *self.masks.values()):
+                del values[0]
+                values.append(None)
+            states = [each.state for each in (*self.guide.values(), *self.prior.values()) if each.has_history]
+            for rows in (*self.paths.values(), *self.past_states.values(), *histories(states)):
+                rows.slide()
         self.position = min(self.position + 1, self.known.length - 1)
-        self.noise = {name: self._noise(self.model.encoder[name]) for name in self._local(self.model.latents)}
+        self.noise = {name: self._noise(self.model.encoder[name]) for name in self.drawn_names}
         self.ahead = {}
         return low
 
-    def _select(self, rows: Tensor, *names: str) -> None:
-        """Replace particles by those with these rows (N,)."""
-        names = ("statics", "paths", "guide", "prior", "states", "past_states", *names)
+    def _select(self, rows: Tensor | None) -> None:
+        """Replace particles by those with these rows (N,), or by copies."""
+        names = "statics", "paths", "guide", "prior", *(("states", "past_states") if self.model.summed else ())
         vars(self).update(zip(names, select([getattr(self, name) for name in names], rows), strict=True))
 
     def fork(self) -> Particles:
         """Return a copy whose steps do not change these particles."""
         forked = copy(self)
-        forked._select(torch.arange(len(self.sequence), device=self.sequence.device), "data", "masks")
+        forked._select(None)
+        forked.data, forked.masks = ({n: [*v] for n, v in values.items()} for values in (self.data, self.masks))
         return forked
 
     def feed(self, run: Rollout, t: int, names: list[str]) -> None:
@@ -176,8 +191,8 @@ class Particles:
             mask = run.mask(name)
             masks[self.position] = None if mask is None else pick(mask[:, t], self.sequence)
 
-    def weigh(self) -> None:
-        """Draw the latents at the step from their proposals, and multiply the weights by those of the step."""
+    def weigh(self) -> Tensor:
+        """Draw the latents at the step from their proposals, and update and `normalise` the weights."""
         t, total = self.position, self.log_weights.new_zeros(len(self.sequence))
         reads = {**self.paths, **self.data}  # the guide reads data as given, and the model its means where they miss
         for name, each in self.guide.items():
@@ -207,13 +222,15 @@ class Particles:
                     value = torch.where(observed, value, each.conditional.mean(parameters))
                 self.paths[name][t] = value
         self.log_weights = self.log_weights + total.view_as(self.log_weights)
-        self.joint = (start + logs).log_softmax(1)
-        for name in self.past_states:
-            self.past_states[name][t] = self.joint if name == "joint" else logs
-        windows = self.joint.unflatten(1, self.shape)
-        if self.shape[1] > 1:  # forget the oldest step of the window
-            windows = windows.flatten(-2).unflatten(-1, (self.shape[2], -1)).movedim(-2, -1)
-        self.states = windows.logsumexp(-1)
+        if self.model.summed:
+            self.joint = (start + logs).log_softmax(1)
+            for name in self.past_states:
+                self.past_states[name][t] = self.joint if name == "joint" else logs
+            windows = self.joint.unflatten(1, self.shape)
+            if self.shape[1] > 1:  # forget the oldest step of the window
+                windows = windows.flatten(-2).unflatten(-1, (self.shape[2], -1)).movedim(-2, -1)
+            self.states = windows.logsumexp(-1)
+        return self.normalise()
 
     def predict(self) -> dict[str, tuple[Conditional, Parameters, Tensor]]:
         """Return the distribution of each local data variable at the step, before its data are used.
@@ -221,14 +238,13 @@ class Particles:
         Each is a mixture of C components per sequence: its conditional, its parameters (C B, ...) and the log weights
         (C, B). Latents are drawn from the model, with the noise of the step.
         """
-        t, joint, result, everyone = self.position, self._joint(), {}, torch.arange(len(self.sequence))
-        history = overlay = {**self.data, **self.paths}
+        t, joint, result, history = self.position, self._joint(), {}, {**self.data, **self.paths}
         with nullcontext() if self.adopts else seeded(None, joint.device):  # later draws stay the same
             for name, each in self.prior.items():
                 if self.adopts or not (self.instant[name] or each.places is not None):
                     parameters = self.ahead[name] = each.step(t, history)
                 else:
-                    parameters = each.select(everyone.to(joint.device)).step(t, overlay)
+                    parameters = each.select(None).step(t, history)
                 if name in self.model.summed:
                     joint = joint + each.logits(parameters, t)
                     continue
@@ -242,7 +258,7 @@ class Particles:
                 if self.adopts:
                     self.paths[name][t] = value
                 else:
-                    overlay = {**overlay, name: overlay[name].replaced(t, value)}
+                    history[name] = history[name].replaced(t, value)
         return result
 
     def _draw(self, each: Stepwise, parameters: Parameters, name: str, joint: Tensor) -> Tensor:
@@ -257,7 +273,7 @@ class Particles:
 
     def _component_weights(self, each: Stepwise, joint: Tensor, t: int) -> Tensor:
         """Return normalised log weights (C, B) of the components of a mixture."""
-        weights = self.log_weights.log_softmax(0)
+        weights = self.log_weights
         if each.places is None:
             return weights
         place = each.place(t).expand(len(joint), -1)
@@ -274,20 +290,15 @@ class Particles:
             The log of the estimated evidence (B,), the effective sample sizes (T, B), NaN at padding, and the number of
             resamplings (B,).
         """
-        self.start()
-        bound, effective, length = self.log_weights.new_zeros(self.known.batch), [], self.known.length
+        bound, effective, length = self.start(), [], self.known.length
         resamplings = torch.zeros_like(bound, dtype=torch.long)
         valid = None if self.known.lengths is None else valid_steps(self.known.lengths, length).t()
         for t in range(length):
-            before = log_mean(self.log_weights)
-            low = self.begin(resample_below, None if valid is None else valid[t])
-            bound = torch.where(low, bound + before, bound)
-            resamplings += low
-            self.weigh()
-            size = effective_size(self.log_weights)
-            effective.append(size if valid is None else size.masked_fill(~valid[t], math.nan))
-        self.log_weights = self.log_weights + self._draw_statics(late=True).view_as(self.log_weights)
-        return bound + log_mean(self.log_weights), torch.stack(effective), resamplings
+            resamplings += self.begin(resample_below, None if valid is None else valid[t])
+            bound = bound + self.weigh()
+            effective.append(self.effective if valid is None else self.effective.masked_fill(~valid[t], math.nan))
+        late = self._draw_statics(late=True).view_as(self.log_weights)
+        return bound + (self.log_weights + late).logsumexp(0), torch.stack(effective), resamplings
 
     @property
     def drawn(self) -> dict[str, Tensor]:
@@ -303,9 +314,10 @@ class Particles:
 
     def summary(self, lag: int) -> dict[str, dict[str, Tensor]]:
         """Return moments (B, D) of each latent, and of states their probabilities, `lag` steps ago given all data."""
-        values = {name: value.unflatten(0, self.log_weights.shape) for name, value in self.latents(lag).items()}
+        weights, values = self.log_weights.exp()[..., None], self.latents(lag)
         moments = {
-            name: moments_of_mixture(each, torch.zeros_like(each), self.log_weights) for name, each in values.items()
+            name: moments_of_mixture(value.reshape(*weights.shape[:2], -1), 0.0, weights)
+            for name, value in values.items()
         }
         mean, variance = ({name: pair[i] for name, pair in moments.items()} for i in range(2))
         return {"mean": mean, "variance": variance, "states": self.state_probabilities(lag)}
@@ -345,7 +357,7 @@ class Particles:
         for s in range(t, max(t - lag, 0), -1):  # `later` is the log density of later data given the states so far
             later = (self.past_states["logs"][s].unflatten(1, self.shape) + self._following(later)).logsumexp(-1)
             joint = self.past_states["joint"][s - 1] + self._following(later).flatten(1)
-        weights = self.log_weights.softmax(0)[..., None]
+        weights = self.log_weights.exp()[..., None]
         total = (joint.softmax(1).unflatten(0, weights.shape[:2]) * weights).sum(0)
         names = [*sums.statics, *(f"{name} {i}" for i in range(sums.lag, -1, -1) for name in sums.chain)]
         total = total.unflatten(1, [sums.sizes[name.split(" ")[0]] for name in names])
@@ -361,13 +373,15 @@ class Particles:
 
     def _joint(self) -> Tensor:
         """Return log weights (N, J) of the joint discrete states, before any variable of the step."""
+        if not self.model.summed:
+            return self.states[..., 0]
         return self.states[..., None].expand(*self.states.shape, self.shape[2]).flatten(1)
 
     # Static variables, and networks -------------------------------------------------------------------------------
 
     def _draw_statics(self, late: bool) -> Tensor:
         """Draw the static latents that precede the steps, or follow them if `late`, and return log weights (N,)."""
-        model, total = self.model, like(self.model).new_zeros(len(self.sequence))
+        model, total = self.model, self.log_weights.new_zeros(len(self.sequence))
         for name in model.latents:
             if not model.generative.local(name) and (name in self.late) == late and self.proposal[name] == "guide":
                 conditional = model.encoder[name]
@@ -388,7 +402,7 @@ class Particles:
         return total
 
     def _noise(self, conditional: Conditional) -> Tensor:
-        noise: Tensor = conditional.head.noise((len(self.sequence), conditional.size), like(self.model))
+        noise: Tensor = conditional.head.noise((len(self.sequence), conditional.size), self.log_weights)
         return noise
 
     def _parameters(self, conditional: Conditional, shared: Mapping[str, Tensor]) -> Parameters:
@@ -432,7 +446,8 @@ class Particles:
                 parents = {n: pick(value, rows) for n, value in parents.items()}
                 return Stepwise(conditional, None, reads, places, patterns, len(rows), parents)
         state = conditional.start(parents, size, self.known.length, lengths)
-        return Stepwise(conditional, conditional.select(state, rows), reads, places, patterns, len(rows))
+        state, has_history = conditional.select(state, rows), any(True for _ in histories(state))
+        return Stepwise(conditional, state, reads, places, patterns, len(rows), has_history=has_history)
 
     def _known_parents(
         self, conditional: Conditional, shared: Mapping[str, Tensor]
@@ -471,6 +486,7 @@ class Stepwise:
         patterns: n, number of patterns; row p N + i of the parameters is pattern p of particle i.
         rows: n N, number of rows.
         given: parents that do not change, for a conditional without a state.
+        has_history: whether the state contains draws of earlier steps.
     """
 
     conditional: Conditional
@@ -480,6 +496,7 @@ class Stepwise:
     patterns: int = 1
     rows: int = 0
     given: Mapping[str, Tensor] | None = None
+    has_history: bool = False
 
     def step(self, t: int, history: Mapping[str, Any]) -> Parameters:
         """Return the distribution's parameters (n N, D) at step t."""
@@ -523,15 +540,18 @@ class Stepwise:
     def _placed(self, logs: Tensor, t: int) -> Tensor:
         return logs.unflatten(0, (self.patterns, -1)).transpose(0, 1).flatten(1).index_select(1, self.place(t))
 
-    def select(self, rows: Tensor) -> Stepwise:
-        """Return the conditional for these particles."""
-        if self.patterns > 1:
+    def select(self, rows: Tensor | None) -> Stepwise:
+        """Return the conditional for these particles, or a copy for None."""
+        if self.patterns > 1 and rows is not None:
             first = torch.arange(self.patterns, device=rows.device)[:, None]
             rows = (first * (self.rows // self.patterns) + rows).flatten()
         state = (
             self.conditional.select(self.state, rows) if self.reads and self.given is None else select(self.state, rows)
         )
-        return replace(self, state=state, given=None if self.given is None else select(dict(self.given), rows))
+        given = None if self.given is None else select(dict(self.given), rows)
+        return Stepwise(
+            self.conditional, state, self.reads, self.places, self.patterns, self.rows, given, self.has_history
+        )
 
 
 def _tile(value: Any, count: int) -> Any:
@@ -543,10 +563,17 @@ def is_windowed(conditional: Conditional) -> bool:
     return conditional.network is not None and not conditional.network.streams
 
 
-def effective_size(log_weights: Tensor) -> Tensor:
-    """Return the effective sample size (B,) of weights (K, B): (sum w)^2 / sum w^2."""
-    weights = (log_weights - log_weights.amax(0)).exp()  # the difference of two large logs would lose all digits
-    return weights.sum(0).square() / weights.square().sum(0)
+def normalise(log_weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return normalised log weights (K, B), the log of the sum of the weights (B,), and the effective sample size (B,).
+
+    The effective sample size is (sum w)^2 / sum w^2. If all weights of a sequence are 0, they become equal.
+    """
+    largest = log_weights.amax(0)
+    relative = torch.where(largest > -math.inf, log_weights - largest, 0.0)
+    weights = relative.exp()
+    total = weights.sum(0)
+    log_total = total.log()
+    return relative - log_total, largest + log_total, total.square() / weights.square().sum(0)
 
 
 def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
@@ -556,29 +583,23 @@ def ancestors(log_weights: Tensor, mask: Tensor) -> Tensor:
     where `mask` (B,) is False are their own ancestors.
     """
     count, batch = log_weights.shape
-    identity = torch.arange(count, device=log_weights.device)[:, None]
-    cumulative = log_weights.double().softmax(0).cumsum(0)
-    points = (identity + torch.rand(batch, dtype=torch.double, device=identity.device)) / count * cumulative[-1]
-    resampled = torch.searchsorted(cumulative.t().contiguous(), points.t().contiguous(), right=True).t()
-    particle = torch.where(mask, resampled.clamp_(max=count - 1), identity)
-    return (particle * batch + torch.arange(batch, device=identity.device)).flatten()
+    identity = torch.arange(count * batch, device=log_weights.device).view(count, batch)
+    cumulative = log_weights.t().double().softmax(1).cumsum(1).contiguous()
+    uniform = torch.rand(batch, 1, dtype=torch.double, device=log_weights.device)
+    points = (torch.arange(count, device=log_weights.device) + uniform) / count * cumulative[:, -1:]
+    particle = torch.searchsorted(cumulative, points, right=True).clamp_(max=count - 1)
+    return torch.where(mask, particle.t() * batch + identity[0], identity).flatten()
 
 
-def moments_of_mixture(means: Tensor, variances: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
+def moments_of_mixture(means: Tensor, variances: Tensor | float, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean and variance (B, D) of a mixture.
 
     Args:
         means, variances: moments (C, B, D) of the components.
-        log_weights: their log weights (C, B), which need not be normalised.
+        weights: their weights (C, B, 1).
     """
-    weights = log_weights.softmax(0)[..., None]
     mean = (weights * means).sum(0)
     return mean, (weights * (variances + (means - mean).square())).sum(0)
-
-
-def log_mean(log_weights: Tensor) -> Tensor:
-    """Return the log mean (B,) of weights (K, B)."""
-    return log_weights.logsumexp(0) - math.log(len(log_weights))
 
 
 def _log_prob(conditional: Conditional, parameters: Parameters, value: Tensor, mask: Tensor | None = None) -> Tensor:

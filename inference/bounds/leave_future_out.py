@@ -28,7 +28,7 @@ from ...networks.loop import valid_steps
 from ...program.batch import AnyBatch, repeat
 from ...program.gaussian import is_linear_gaussian
 from ...program.model import DynamicalVAE
-from ...program.particles import effective_size, reads_ahead
+from ...program.particles import normalise, reads_ahead
 from .elbo import importance_weights, require_data, require_densities
 from .particles import fivo_bound, obstacle
 
@@ -98,7 +98,8 @@ def leave_future_out(
         batch: batch as in `DynamicalVAE.model`, which may be ragged or have missing entries.
         observed: L, number of steps before the first forecast.
         horizon: M, number of steps of each forecast.
-        particles: K, number of particles of each of the R estimates.
+        particles: K, number of particles of each of the R estimates. Double it until the Monte Carlo error is small
+            compared with the differences between models and the smallest effective sample size is above 20.
         chunk: largest number of sequences times particles in memory.
 
     Raises:
@@ -169,7 +170,8 @@ def _evidences(model: DynamicalVAE, data: Batch, particles: int, chunk: int) -> 
     if obstacle(model, data):
         weights = importance_weights(model, data, size, REPLICATES * particles, chunk)
         log_weights = weights.unflatten(0, (REPLICATES, -1)).transpose(0, 1)
-        return log_weights.logsumexp(0) - math.log(particles), effective_size(log_weights).mean(0)
+        _, total, effective = normalise(log_weights)
+        return total - math.log(particles), effective.mean(0)
     bound = fivo_bound(model, repeat(data, REPLICATES), particles, chunk=chunk)
     least = bound.effective.nan_to_num(math.inf).amin(0)
     return bound.bound.unflatten(0, (REPLICATES, -1)), least.unflatten(0, (REPLICATES, -1)).mean(0)

@@ -177,6 +177,11 @@ def evaluate(
             *dict.fromkeys([*eval_windows.notes, *(measure.note for measure in measures if measure.note)]),
             *(available.notes if references is True else ()),
             *_given_notes({name: count for name, (count, _) in external.items()}, samples if models else None),
+            *(
+                f"{name} has samples outside the values of a column, which are scored as they are: {'; '.join(columns)}"
+                for name, each in given.items()
+                if (columns := [*each.outside(windows)])
+            ),
             *_forecast_notes(
                 measures,
                 samples,

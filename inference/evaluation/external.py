@@ -18,7 +18,7 @@ import io
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +33,8 @@ from ... import files
 from ...data.blocks import hash_values
 from ...data.npy import mapped, npz_arrays
 from ...data.sequences import HeldOutWindows, columns_of, tensor_of
+from ...distributions.family import FAMILIES, Family
+from ...program.batch import describe_support
 from .baselines import Forecaster
 from .evaluation_windows import EvaluationWindows, prepare_windows
 
@@ -98,7 +100,8 @@ class ForecastSamples:
             kind = f"an empty {type(given).__name__}" if isinstance(given, Mapping | list | tuple) else brief(given)
             raise TypeError(
                 f"{name!r} is {kind}; expected a model that forecasts, such as a DynamicalVAE (see "
-                "dvae.program.protocols.Forecasting for the methods that it needs), or samples (K, N, T, D)"
+                "dvae.program.protocols.Forecasting for the methods that it needs), or samples (K, N, T, D): an array "
+                "or the path of a file, such as `save` of the forecasts of a run writes"
             )
         keys = [_key(key, name) for key in given] if isinstance(given, Mapping) else None
         listed = given.values() if isinstance(given, Mapping) else given
@@ -225,6 +228,17 @@ class ForecastSamples:
         places = {key: place for place, key in enumerate(given)}
         return torch.tensor([places[key] for key in keys])
 
+    def outside(self, windows: HeldOutWindows) -> Iterator[str]:
+        """Yield a description of the first sample of each column that its family excludes, such as a negative count."""
+        values, names = tensor_of(self.values), column_names(windows)
+        for place, family in enumerate(getattr(windows, "families", ())):
+            spec = FAMILIES[family]
+            if not isinstance(spec, Family) or family == "category":  # a category has several columns
+                continue
+            support: Any = spec.kind.support
+            if len(wrong := values[..., place][~support.check(values[..., place])]):
+                yield f"{names[place]} has {wrong[0]:g}, but its values are {describe_support(support)}"
+
     def record(self) -> dict[str, Any]:
         """Return shape and SHA-256 of the samples, for the record of an evaluation."""
         digest = hashlib.sha256()
@@ -277,8 +291,8 @@ def windows_to_forecast(windows: Any, whole: bool = False) -> dict[str, np.ndarr
 
     Returns:
         `split`, `sequence` and `start` (N,), the keys of the windows, which a file of forecasts contains too;
-        `observed` (N, O, D), NaN where missing; `horizon`, the number of steps T to predict; and `columns` (D,), if
-        they have names.
+        `observed` (N, O, D), NaN where missing; `horizon`, the number of steps T to predict; `columns` (D,), if they
+        have names; and `time` (N, O + T) of all steps as text, if they have times.
     """
     held = prepare_windows(windows)
     x, (split, sequence, start) = held.batch.mask_to_nan().numpy(), zip(*held.keys, strict=True)
@@ -287,6 +301,11 @@ def windows_to_forecast(windows: Any, whole: bool = False) -> dict[str, np.ndarr
         {"columns": names} if (names := column_names(held.windows)) else {}
     )
     arrays |= {"future": x[:, held.observed :]} if whole else {}
+    if hasattr(held.windows, "times"):
+        times, calendar = held.windows.times(x.shape[1])
+        if times is not None:
+            moments, places = np.unique(times, return_inverse=True)
+            arrays["time"] = np.array([calendar.text(moment) for moment in moments])[places.reshape(times.shape)]
     return {name: np.array(value) for name, value in arrays.items()}
 
 

@@ -308,17 +308,17 @@ def draw_flow(
     z = z.flatten(0, 1) if data.lengths is None else z[valid_steps(data.lengths, z.shape[1])]
     plane = z[:, list(coordinates)]
     grid = torch.cartesian_prod(
-        *(torch.linspace(low, high, 21) for low, high in zip(*plane.aminmax(dim=0), strict=True))
+        *(torch.linspace(low, high, 21) for low, high in zip(*plane.cpu().aminmax(dim=0), strict=True))
     )
     at = z.mean(0).repeat(len(grid), 1)
-    at[:, list(coordinates)] = grid
+    at[:, list(coordinates)] = grid.to(at)
     each = torch.eye(states).to(z)
     inputs = torch.cat([each.expand(len(at), -1, -1), at[:, None].expand(-1, states, -1)], -1)
     chains = transitions(inputs).double().softmax(-1)
     state = torch.linalg.matrix_power(chains, 2**20).mean(1).argmax(-1)
-    moves = (dynamics.features_at(each[state], at)[:, :size] - at)[:, list(coordinates)]
+    moves = (dynamics.features_at(each[state], at)[:, :size] - at)[:, list(coordinates)].cpu()
     ax = plt.figure(layout="constrained").add_subplot() if ax is None else ax
-    ax.plot(*plane.mT, ".", color="0.8", markersize=1, zorder=0)
+    ax.plot(*plane.mT.cpu(), ".", color="0.8", markersize=1, zorder=0)
     ax.quiver(*grid.mT, *moves.mT, color=[f"C{k}" for k in state.tolist()], angles="xy")
     for k in state.unique().tolist():
         ax.plot([], [], color=f"C{k}", label=f"k = {k}")

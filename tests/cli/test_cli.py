@@ -124,6 +124,7 @@ def test_show_prints_the_audit_and_draws_the_graph(capsys, tmp_path):
         ("fit vae --out FILE", "is a file; name a directory"),
         ("resume RUN --steps 0", "steps is 0"),
         ("evaluate RUN --samples 0", "--samples is 0; it must be at least 1"),
+        ("compare RUN --samples 0", "--samples must be at least 1, got 0; use --no-forecasts"),
         ("evaluate RUN --bound-particles -1", "--bound-particles is -1; it must be at least 0"),
         ("evaluate RUN --out .", "--out . is a directory; name a file"),
         ("evaluate RUN --figure scores.xyz", "--figure scores.xyz: the suffix selects the format, one of"),

@@ -79,6 +79,8 @@ def test_blended_futures_are_marked_in_their_file(futures, tmp_path):
     futures.blended(3).save(tmp_path / "a.npz")
     loaded = motion.Forecasts.load(tmp_path / "a.npz")
     assert loaded.blend == 3
+    names = [[clip.name for clip in each.motion()] for each in (loaded, futures)]
+    assert names[0] == [f"{name}-blended" for name in names[1]]
     with np.load(tmp_path / "a.npz") as file:
         np.testing.assert_allclose(file["largest_steps"], loaded.largest_steps())
     for frames, forecasts in ((0, futures), (HORIZON + 1, futures), (3, loaded)):

@@ -306,6 +306,20 @@ def test_a_stream_of_an_exact_filter_continues_and_resumes(tmp_path):
     torch.testing.assert_close(draws.mean["z"], whole.filtered.mean["z"], rtol=0, atol=0.05)
 
 
+@torch.no_grad()
+def test_the_oracle_and_a_stream_of_affine_dense_networks_agree():
+    text, sizes = "p(w) p(z_t | z_{t-1}, w) p(x_t | z_t, x_{t-1}) p(y_t | z_t)", {"w": 1, "z": 2, "x": 2, "y": 1}
+    model = build((text, None), sizes, Dense(()), FixedNormal(0.5), observed=("x", "y"))
+    batch = {"x": torch.randn(3, T, 2, dtype=DOUBLE), "y": torch.randn(3, T, 1, dtype=DOUBLE)}
+    batch["mask"] = {"x": torch.rand(3, T, 2) > 0.3}
+    stream = model.filter({"x": batch["x"][:, :1], "y": batch["y"][:, :1], "mask": {"x": batch["mask"]["x"][:, :1]}})
+    total = stream.filtered.log_evidence[:, 0]
+    for t in range(1, T):
+        step = {"x": batch["x"][:, t], "y": batch["y"][:, t], "mask": {"x": batch["mask"]["x"][:, t]}}
+        total = total + stream.update(step).log_evidence[:, 0]
+    torch.testing.assert_close(total, Oracle(model, T).evidence(batch), rtol=0, atol=1e-9)
+
+
 # -------------------------------------------------------------------------------------------------------- calibration
 
 

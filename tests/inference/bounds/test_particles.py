@@ -10,7 +10,7 @@ from dvae import DynamicalVAE, Oracle, fivo_bound, linear_gaussian_surrogate
 from dvae.factorization.notation import Factorization
 from dvae.networks import Attention, Dense, Linear, Recurrent
 from dvae.program.batch import repeat
-from dvae.program.particles import ancestors, effective_size
+from dvae.program.particles import ancestors, normalise
 
 T = 5
 PAIRS = {
@@ -152,7 +152,7 @@ def textbook(model, batch, particles, resample_below):
     latents |= {name: torch.zeros(n, T, model.sizes[name], dtype=torch.float64) for name in moving}
     lengths = batch.get("lengths", torch.full((shape[1],), T))
     for t in range(T):
-        low = (effective_size(weight.view(shape)) < resample_below * particles) & (t < lengths)
+        low = (normalise(weight.view(shape))[2] < resample_below * particles) & (t < lengths)
         if (t or statics) and low.any():
             bound = bound + torch.where(low, weight.view(shape).logsumexp(0) - math.log(particles), 0.0)
             rows = ancestors(weight.view(shape), low)

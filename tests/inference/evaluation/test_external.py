@@ -253,10 +253,21 @@ def test_exported_windows_are_the_past_and_the_keys(panel):
     assert list(keys) == test.keys
     assert arrays["horizon"] == 3
     assert arrays["columns"].tolist() == column_names(test)
+    assert arrays["time"].tolist() == [[str(start + step) for step in range(9)] for start in arrays["start"].tolist()]
     assert "future" not in arrays
     train = windows_to_forecast(panel.windows("train"), whole=True)
     both = np.concatenate([train["observed"], train["future"]], 1)
     np.testing.assert_array_equal(both, panel.windows("train").all().mask_to_nan())
+
+
+def test_samples_that_a_family_excludes_are_noted(panel):
+    test = panel.windows("test")
+    samples = test.all()["x"][None, :, 6:].double()
+    assert panel.schema.columns.targets[0].family == "count"
+    assert not any("outside" in note for note in score(samples, test).notes)
+    samples[0, 1, 2, 0] = -2.5
+    (note,) = [note for note in score(samples, test).notes if "outside" in note]
+    assert note.endswith("riders has -2.5, but its values are whole numbers from 0")
 
 
 def test_forecasts_of_a_sequence_in_another_order_are_refused(panel):
