@@ -10,7 +10,7 @@ import numpy as np
 from .calendar import FEATURES, FLAG, Calendar, functions_of_time
 from .columns import ROUNDED, Column
 from .encoding import EVEN
-from .numerals import is_multiple
+from .numerals import resolution
 from .panel import Panel, Series
 from .protocol import Cut
 
@@ -79,7 +79,7 @@ def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
         levels, counts = np.unique(cells[~np.isnan(cells)], return_counts=True)
         if column.role != "target" or column.family not in ROUNDED or column.rounding or not len(levels):
             continue
-        share, level, unit = counts.max() / counts.sum(), levels[counts.argmax()], _resolution(levels)
+        share, level, unit = counts.max() / counts.sum(), levels[counts.argmax()], resolution(levels)
         remedies = [f"rounding = {unit:g}"] if unit else []
         remedies += ["the family sparse-overdispersed"] if unit == 1 and levels[0] == level == 0 else []
         if not unit or share >= HURDLE:
@@ -94,14 +94,6 @@ def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
             "a continuous density has no bound at a value that occurs often, so bounds can grow without limit; declare "
             f"what the brackets propose: {', '.join(spikes)}"
         )
-
-
-def _resolution(levels: np.ndarray) -> float:
-    """Return the largest unit, 1 or 5 times a power of 10, of which all values are multiples; 0 without one."""
-    for unit in (float(f"{digit}e{exponent}") for exponent in range(6, -5, -1) for digit in (5, 1)):
-        if is_multiple(levels, unit).all():
-            return unit
-    return 0.0
 
 
 def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:

@@ -18,7 +18,7 @@ role = "known"                        # a covariate that is also known in the fu
 unit = "°C"
 
 [columns.level]
-rounding = 0.5                        # values are rounded to multiples of this (`dvae.data.views.Dequantised`)
+rounding = 0.5                        # values are rounded to multiples of this, or "auto"
 
 [columns.weather]
 role = "past"                         # a covariate that is known up to the present
@@ -68,7 +68,8 @@ class Column:
         classes: classes of a category, in the order of its coordinates.
         other: class that represents every unlisted value; "" raises an error for such values.
         rounding: unit to which the values of a continuous target are rounded; models add uniform noise of this width
-            (`dvae.data.views.Dequantised`). 0 for none.
+            (`dvae.data.views.Dequantised`). 0 for none; "auto" for the largest unit, 1 or 5 times a power of 10, of
+            which all values are multiples. `Panel` replaces "auto".
 
     Raises:
         ValueError: if the family is unknown, a category has no classes, `other` is not one of them, or rounding does
@@ -81,7 +82,7 @@ class Column:
     unit: str = ""
     classes: tuple[str, ...] = ()
     other: str = field(default="", repr=False)  # fingerprints of panels include the fields above
-    rounding: Amount = field(default=0.0, repr=False)
+    rounding: Amount | Literal["auto"] = field(default=0.0, repr=False)
 
     def __post_init__(self) -> None:
         check(self)
@@ -108,7 +109,7 @@ class Column:
             )
         if self.rounding and (self.role != "target" or self.family not in ROUNDED):
             raise ValueError(
-                f"column {self.name!r} has rounding = {self.rounding:g}, but is a {self.role} of family "
+                f"column {self.name!r} has rounding = {self.rounding}, but is a {self.role} of family "
                 f"{self.family!r}; rounding is for targets of a continuous family: {', '.join(ROUNDED)}"
             )
 

@@ -202,3 +202,11 @@ def is_multiple(values: np.ndarray, unit: float) -> np.ndarray:
     multiples = values / unit
     difference: np.ndarray = np.abs(multiples - np.rint(multiples))
     return difference <= (1e-6 * np.abs(multiples)).clip(max=0.1)
+
+
+def resolution(values: np.ndarray) -> float:
+    """Return the largest unit, 1 or 5 times a power of 10, of which all values are multiples; 0 without one."""
+    for unit in (float(f"{digit}e{exponent}") for exponent in range(6, -5, -1) for digit in (5, 1)):
+        if is_multiple(values, unit).all():
+            return unit
+    return 0.0

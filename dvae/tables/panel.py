@@ -31,7 +31,7 @@ from .calendar import NUMBERS, Calendar
 from .clocks import time_of
 from .column_inference import LARGEST, TIMES, ColumnHints, is_date
 from .columns import Column, Columns
-from .numerals import is_multiple, read_numbers
+from .numerals import is_multiple, read_numbers, resolution
 from .parsing import is_duration, is_number, numeric, tabular, texts, times
 
 SPLITS = ("train", "validation", "test")
@@ -130,11 +130,28 @@ class Panel:
                 sequence.times.shape != (len(sequence),) or not (np.diff(sequence.times) > 0).all()
             ):
                 raise ValueError(f"{label} has times that are not strictly increasing")
+        if any(column.rounding == "auto" for column in self.columns.columns):
+            object.__setattr__(self, "columns", self._with_rounding())
         object.__setattr__(self, "complete", self._check())
+
+    def _with_rounding(self) -> Columns:
+        """Return the columns with the unit of their values in place of "auto"."""
+        columns = self.columns
+        for index, column in enumerate(columns.columns):
+            if column.rounding == "auto":
+                blocks = (block[:, index] for block in row_blocks(sequence.values for sequence in self.series))
+                unit = min(resolution(block[~np.isnan(block)]) for block in blocks)  # each unit divides the larger ones
+                if not unit:
+                    raise ValueError(
+                        f'column {column.name!r} has rounding = "auto", but its values in {self.name} are no '
+                        "multiples of a unit from 0.0001 on; give the unit as a number, or leave rounding out"
+                    )
+                columns = columns.but(column.name, rounding=unit)
+        return columns
 
     def _check(self) -> frozenset[str]:
         """Check that values are valid for the family of their column; return the names of complete mapped sequences."""
-        kinds: dict[tuple[str, int, float], list[int]] = {}
+        kinds: dict[tuple[str, int, float | str], list[int]] = {}
         for index, column in enumerate(self.columns.columns):
             kinds.setdefault((column.family, len(column.classes), column.rounding), []).append(index)
         ends, start, incomplete = np.cumsum([len(sequence) for sequence in self.series]), 0, set[int]()
@@ -367,7 +384,8 @@ def _validity_test(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], 
         "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
     }
     is_valid, domain = tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
-    if unit := column.rounding:
+    if column.rounding:
+        unit = float(column.rounding)
         return (lambda v: is_valid(v) & is_multiple(v, unit)), f"{domain} that are multiples of its rounding, {unit:g}"
     return is_valid, domain
 

@@ -61,6 +61,19 @@ def test_repeated_values_of_a_continuous_column_are_a_spike():
         Panel([Series("s", np.array([[0.1], [0.3], [-7], [0.25]]))], Columns((Column("x", rounding=0.1),)))
 
 
+def test_automatic_rounding_is_the_unit_of_the_values():
+    values = noise(3, 200, 1)
+    series = [Series(str(n), np.where(x < 0, np.nan, (2 * x).round(0) / 2)) for n, x in enumerate(values)]
+    columns = Columns.from_toml('[columns.x]\nrounding = "auto"')
+    panel = Panel(series, columns)
+    assert panel.columns == columns.but("x", rounding=0.5)
+    assert columns == Columns.from_toml(columns.to_toml())
+    with pytest.raises(ValueError, match=r"rounding = \"auto\", but its values in .* are no multiples"):
+        Panel([*series, Series("continuous", values[0])], columns)
+    with pytest.raises(ValueError, match="rounding = auto, but is a target of family 'count'"):
+        columns.but("x", family="count")
+
+
 def test_absent_rows_are_named():
     days = np.arange(100)
     (text,) = found(noise(3, 98, 1), times=DAY * np.delete(days, [20, 50]))

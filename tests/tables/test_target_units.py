@@ -187,6 +187,27 @@ def test_runs_store_the_units(data, tmp_path):
     np.testing.assert_array_equal(expected, draws)
 
 
+@pytest.mark.parametrize(
+    ("units", "seasons", "level", "drift", "amplitude"),
+    [
+        ("columns", 7, 0, 0, 4),
+        ("columns", 3, 0, 0, 0),
+        ("series", 3, 5, 0, 0),
+        ("series", 7, 5, 0, 4),
+        ("changes", 3, 5, 1, 0),
+        ("seasonal", 3, 5, 0, 4),
+    ],
+)
+def test_methods_take_the_units_that_the_training_windows_prefer(units, seasons, level, drift, amplitude):
+    random, season = np.random.default_rng(0), np.tile([0, 1, 0, -1], 20)
+    levels, steps = random.normal(0, level, (30, 1)), random.normal(0, drift, (30, 80)).cumsum(1)
+    values = levels + steps + amplitude * season + random.normal(0, 0.3, (30, 80))
+    data = PanelData.of(values[..., None], cut=Cut(4 * seasons, 4, season=4))
+    assert data.schema.preferred == units
+    assert dvae.method("srnn").resolve_defaults(data.windows("train")).units == units
+    assert dvae.method("srnn", units="seasonal").resolve_defaults(data.schema).units == "seasonal"
+
+
 def test_residual_means_of_tables_add_the_previous_value():
     method = dvae.method("autoregressive", width=4, residual=1.0)
     assert method.of_columns(FAMILIES["robust"]).residual == 1
