@@ -38,6 +38,8 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 FREQUENCIES = (1, 2, 4, 8)
 """Frequencies of the level's sines and cosines, which the denoiser reads."""
 LEVEL_SIZE = 2 * len(FREQUENCIES)
+RHO = 7
+"""The sampler's steps are equal in tan(a)^(1 / RHO) (Karras et al., 2022, arXiv 2206.00364, equation 5)."""
 EXACT_DIMENSION = 64
 """Largest number of coordinates for which `exact_log_prob` computes the trace exactly by default."""
 
@@ -223,6 +225,10 @@ class DenoisingModule(ConditionalDistribution):
         """Return the angle a (...) at times t (...) from 0, the data, to 1."""
         raise NotImplementedError
 
+    def sampler_angles(self, t: Tensor) -> Tensor:
+        """Return the angles (...) at which the sampler evaluates the denoiser, for t (...) from 1, noise, to 0."""
+        return self.angle(t)
+
     def score(self, parameters: Parameters, value: Tensor) -> Tensor:
         """Return the contribution (..., D) of each entry of values (..., D) to `log_prob` of the Pyro distribution."""
         raise NotImplementedError
@@ -242,7 +248,7 @@ class DenoisingModule(ConditionalDistribution):
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         loc, scale, features, *steps = parameters
         spec, z = self.spec, noise
-        levels = self.angle(torch.linspace(1, 0, spec.steps + 1, dtype=loc.dtype, device=loc.device)).unbind()
+        levels = self.sampler_angles(torch.linspace(1, 0, spec.steps + 1, dtype=loc.dtype, device=loc.device)).unbind()
 
         def denoised(z: Tensor, angle: Tensor) -> Tensor:
             angle = angle.expand(self._level_shape(z))
@@ -367,6 +373,11 @@ class DiffusionModule(DenoisingModule):
             return (torch.lerp(*self.noise_range, t) / 2).exp().atan()
         low, high = self._shifted_range()
         return (math.exp(-self.spec.shift / 2) * torch.lerp(low, high, t).tan()).atan()
+
+    @override
+    def sampler_angles(self, t: Tensor) -> Tensor:
+        low, high = ((end / 2 / RHO).exp() for end in self.noise_range)
+        return (torch.lerp(low, high, t) ** RHO).atan()
 
     def weight(self, t: Tensor) -> Tensor:
         """Return w = cot(a) da / dt at times t (...)."""

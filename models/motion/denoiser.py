@@ -95,7 +95,7 @@ class MotionDenoiser(FutureMethod):
     layers: Layers = 3
     coefficients: Extra = 20
     sampler: Literal["heun", "ddim", "ancestral"] = "heun"
-    sampler_steps: Count = 15
+    sampler_steps: Count = 6
     drop: Annotated[float, Range(0, 1, below=True)] = 0.0
     guidance: Amount = 1.0
     min_scale: Positive = 0.001
