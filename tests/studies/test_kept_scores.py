@@ -11,6 +11,7 @@ from benchmarks.studies import engine, pairs, papers, ranking, results, tuning
 from dvae.inference.training.checkpoints import Run
 from dvae.models.motion.poses import PoseMethod
 from dvae.motion import WALKER
+from dvae.runs.directory import read_config
 
 SETS = sorted(file.stem for file in ranking.SCORES.glob("*.zip"))
 RUNS = [
@@ -42,6 +43,7 @@ def test_scores_contain_no_paths(of):
 def test_metric_models_contain_no_paths(file):
     assert '"/' not in file.read_text(encoding="utf-8")
     assert (file.parent / "best.safetensors").stat().st_size < 2**20
+    read_config(file.parent)
     assert Run(file.parent).state["status"] in ("finished", "stopped early")  # of the present format
 
 
