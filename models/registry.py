@@ -31,6 +31,7 @@ METHODS = {
     "dsae": "dvae.models.family.dsae:DSAE",
     "kvae": "dvae.models.family.kvae:KVAE",
     "rslds": "dvae.models.family.rslds:RSLDS",
+    "csdi": "dvae.models.family.csdi:CSDI",
     "autoregressive": "dvae.models.family.autoregressive:Autoregressive",
     "moglow": "dvae.models.baselines.moglow:MoGlow",
     "moglow-paths": "dvae.models.baselines.moglow_paths:MoGlowPaths",

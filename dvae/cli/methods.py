@@ -105,7 +105,7 @@ def show(
         OUT.print(pair_audit.verdict)
     else:
         reason = "all latents are summed out" if summed else "the model has no latents"
-        OUT.print(f"{reason}: there is no guide, and the bound is the log evidence")
+        OUT.print(f"{reason}: there is no guide, and the bound is the log evidence if the density of x is exact")
     if method is not None:
         OUT.print("\n".join(_describe_trainings(kind.trainings)), highlight=False, soft_wrap=True)
 

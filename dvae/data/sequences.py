@@ -220,6 +220,43 @@ class RandomMasking:
         return fingerprint
 
 
+@dataclass(frozen=True, eq=False)
+class RandomGiven:
+    """A source that chooses the given entries of x at random, anew in each batch (`views.Given`).
+
+    In half of the windows with a horizon, the observed steps are given, as in a forecast. In each of the others, a
+    random share of the entries is given: single entries or whole steps (the random strategy of Tashiro et al., 2021,
+    which has single entries only). Without a horizon, no entry is given in a tenth of the windows.
+
+    Args:
+        source: source of the batches.
+        observed: number of observed steps of a forecast; None without a horizon.
+    """
+
+    source: Any
+    observed: int | None = None
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
+        """Return a batch of the source with the entry "given" (B, T, D)."""
+        batch = Batch(self.source.sample(batch_size, generator))
+        count, length, size = batch["x"].shape
+
+        def uniform(*shape: int) -> torch.Tensor:
+            return torch.rand(count, *shape, generator=generator)
+
+        steps, entries = uniform(length, 1).expand(-1, -1, size), uniform(length, size)
+        given = torch.where(uniform(1, 1) < 0.5, steps, entries) < uniform(1, 1)
+        rest = torch.arange(length)[:, None] < (self.observed or 0)
+        given = torch.where(uniform(1, 1) < (0.1 if self.observed is None else 0.5), rest, given)
+        return batch | {"given": given.to(batch["x"].device)}
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the source, if it has one."""
+        fingerprint: str = self.source.fingerprint
+        return fingerprint
+
+
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
     """Return means of values over the dimensions `dims`, ignoring NaN."""
     means: Tensor = values.mean(dims)

@@ -34,7 +34,7 @@ from typing_extensions import override
 
 from ..factorization.notation import Factorization
 from .batch import WHOLE, Batch
-from .views import View
+from .views import View, given_entries
 
 LOCATION, SCALE, STATE = "x_location", "x_scale", "x_state"
 """Names of the entries that the view adds: location and scale of each step, and the state after the last step."""
@@ -285,6 +285,29 @@ class SeriesUnits(View):
                     means[..., 0, :] += (values[-1] - means[..., 0, :]) / counts[..., 0, :]
                 state = torch.cat([state[..., :3, :], counts.roll(-1, -2), means.roll(-1, -2)], -2)
         return torch.stack(values, -2)
+
+
+@dataclass(frozen=True)
+class GivenUnits(SeriesUnits):
+    """Values of each sequence relative to one level and one scale, which are estimated from its given entries.
+
+    Level and scale are m_t and s_t of `SeriesUnits` with L = 0, given the entries of `views.given_entries` at all
+    steps. Densities refer to the other entries.
+    """
+
+    @override
+    def _units(self, data: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        z, given = self._transform(data), given_entries(data, self.observed)
+        constants = self._constants(z)
+        deviation = torch.where(given, z - constants["mean"], 0.0)
+        state = torch.stack([given.double(), deviation, deviation.square()], 1).sum(2)
+        zero = torch.zeros_like(z[:, :1])
+        location, scale = self._predict(state[:, :, None].unbind(1), zero, zero + 1, constants)
+        return location.expand_as(z), scale.expand_as(z), state
+
+    @override
+    def log_det(self, data: Batch) -> Tensor:
+        return torch.where(given_entries(data, self.observed), 0.0, super().log_det(data))
 
 
 def _last_values(z: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -44,6 +44,8 @@ class View:
     """Name of the context variable that contains the data themselves."""
     past: int = 0
     """Number of first frames of x that become context."""
+    given: str | None = None
+    """Name of the context variable that contains the given entries of x; the model draws the others."""
     exact: tuple[str, ...] = ()
     """Entries that the view adds in float64 whatever the precision of the model; x is then also read in float64."""
     by_coordinate: bool = False
@@ -228,6 +230,7 @@ class Views(View):
         self.parts = next((view.parts for view in views if view.parts), None)
         self.history = next((view.history for view in views if view.history), None)
         self.past = sum(view.past for view in views)
+        self.given = next((view.given for view in views if view.given), None)
         self.exact = tuple(name for view in views for name in view.exact)
         self.by_coordinate = any(view.by_coordinate for view in views)
         self.measured = ", ".join(view.measured for view in views if view.measured)
@@ -441,3 +444,68 @@ class Past(View):
             return model_values
         first = model_values[self.name].unflatten(-1, (self.frames, -1))
         return model_values | {WHOLE: torch.cat([first, model_values[WHOLE]], -2) if WHOLE in model_values else first}
+
+
+GIVEN = "given"
+"""Name of the batch entry (B, T, D) that is True or 1 where an entry of x is given."""
+
+
+def given_entries(data: Batch, observed: int | None) -> Tensor:
+    """Return True at the given entries (B, T, D) of x, which are observed and neither missing nor padding.
+
+    Args:
+        data: batch in the data's representation.
+        observed: number of first steps that are given if the batch has no entry "given"; None for no step.
+    """
+    x, mask, given = data[WHOLE], data.mask(), data.get(GIVEN)
+    if given is None:
+        given = (torch.arange(x.shape[1], device=x.device) < (observed or 0))[:, None].expand_as(x)
+    given = given > 0 if mask is None else (given > 0) & mask
+    return given if data.lengths is None else given & valid_steps(data.lengths, x.shape[1])[..., None]
+
+
+@dataclass(frozen=True)
+class Given(View):
+    """Given entries of x as local context, for a distribution of the other entries, the targets.
+
+    The context consists of the given values and their indicators, (B, T, 2 D). A model with this view, such as
+    p(x_{1:T} | g_{1:T}), imputes missing entries given all observed ones, and forecasts given all observed steps. The
+    entry "given" (B, T, D) of a batch is 1 where an entry is given; bounds refer to the other observed entries.
+
+    Args:
+        given: name of the context.
+        observed: number of first steps that are given in batches without the entry "given"; None for no step.
+
+    Example:
+        >>> batch = Batch(x=torch.tensor([[[1.0], [2.0]]]), given=torch.tensor([[[True], [False]]]))
+        >>> data = Given("g")(batch)
+        >>> data["mask"]["x"].flatten().tolist(), torch.where(data["mask"]["g"], data["g"], 0.0).tolist()
+        ([False, True], [[[1.0, 1.0], [0.0, 0.0]]])
+    """
+
+    given: str = field()
+    observed: int | None = None
+    names = (GIVEN,)
+
+    @property
+    def measured(self) -> str:  # type: ignore[override]
+        """Quantity that densities refer to: all entries if none is given."""
+        return "" if self.observed is None else f"steps after the first {self.observed} given the first {self.observed}"
+
+    @override
+    def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:
+        if self.given not in context or sizes[self.given] != 2 * sizes[WHOLE]:
+            raise ValueError(
+                f"{self.given!r} has values and indicators of x, so it must be context of size 2 x {sizes[WHOLE]}; "
+                f"the context is {', '.join(f'{name} ({sizes[name]})' for name in context) or 'nothing'}"
+            )
+
+    @override
+    def __call__(self, data: Batch, view_inputs: Batch | None = None) -> Batch:
+        if WHOLE not in data or self.given in data:
+            return data
+        x, masks, given = data[WHOLE], data.masks(), given_entries(data, self.observed)
+        context = torch.cat([x, given.to(x)], -1)
+        masks[self.given] = torch.cat([given, torch.ones_like(given)], -1)
+        masks[WHOLE] = masks[WHOLE] & ~given if WHOLE in masks else ~given
+        return Batch({n: v for n, v in data.items() if n != GIVEN}) | {self.given: context, "mask": masks}

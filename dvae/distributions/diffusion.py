@@ -27,7 +27,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
 from torch import Tensor, nn
-from torch.distributions import constraints
+from torch.distributions import Normal, constraints
 from torch.nn import functional
 from typing_extensions import override
 
@@ -38,6 +38,8 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 FREQUENCIES = (1, 2, 4, 8)
 """Frequencies of the level's sines and cosines, which the denoiser reads."""
 LEVEL_SIZE = 2 * len(FREQUENCIES)
+RHO = 7
+"""The sampler's steps are equal in tan(a)^(1 / RHO) (Karras et al., 2022, arXiv 2206.00364, equation 5)."""
 EXACT_DIMENSION = 64
 """Largest number of coordinates for which `exact_log_prob` computes the trace exactly by default."""
 
@@ -57,7 +59,7 @@ class Diffusion:
     By default, a perceptron denoises the variable at one step (or a static variable) given the features. With a
     `denoiser`, all steps are denoised jointly, for a factor p(x_{1:T} | h). Its parents must be static, or read at
     {1:T}, {<=t} or {<t}. The denoiser at step t then reads the noisy steps 1 to T, or 1 to t if a parent is restricted
-    to the past. Entries are observed or missing by step.
+    to the past.
 
     Without `drop`, m and s are linear functions of the features. Otherwise they do not depend on the features.
 
@@ -67,6 +69,11 @@ class Diffusion:
         schedule: "learned" is linear in the log signal-to-noise ratio, with learned ends; "cosine" is linear in the
             angle a, with fixed ends.
         log_snr: lowest and highest log signal-to-noise ratio, the initial ones if they are learned.
+        shift: number added to the log signal-to-noise ratio of the cosine schedule between its ends; above 0, more
+            times have little noise (Hoogeboom et al., 2023, arXiv 2301.11093).
+        loss: what training minimises. "bound": minus the bound. "velocity": the squared error of v at the times of the
+            schedule, minus the log density of N(m, s^2). It has more weight at high noise levels, so that draws are
+            better and the bound is lower. Training then reports it as an energy; evaluation has the bound.
         steps: number of steps of the sampler.
         sampler: "ancestral", "ddim", or "heun" (second order in data prediction, with two evaluations a step).
         drop: probability that training hides the features of a sequence, for guidance; `log_prob` in training mode is
@@ -81,6 +88,8 @@ class Diffusion:
     denoiser: DenoiserSpec | None = None
     schedule: Literal["learned", "cosine"] = "learned"
     log_snr: tuple[float, float] = (-10.0, 10.0)
+    shift: float = 0.0
+    loss: Literal["bound", "velocity"] = "bound"
     steps: int = 20
     sampler: Literal["ancestral", "ddim", "heun"] = "heun"
     drop: float = 0.0
@@ -107,6 +116,13 @@ class Diffusion:
                 "a Diffusion has the schedule 'learned' or 'cosine' and the sampler 'ancestral', 'ddim' or 'heun', got "
                 f"schedule={self.schedule!r} and sampler={self.sampler!r}"
             )
+        if self.loss not in ("bound", "velocity") or (self.loss == "velocity" and self.schedule == "learned"):
+            raise ValueError(
+                "a Diffusion has the loss 'bound', or 'velocity' with schedule='cosine', got "
+                f"loss={self.loss!r} and schedule={self.schedule!r}"
+            )
+        if self.shift and self.schedule == "learned":
+            raise ValueError(f"`shift` is {self.shift}, but a learned schedule has none; use schedule='cosine'")
         if not -MAX_LOG_SNR <= self.log_snr[0] < self.log_snr[1] <= MAX_LOG_SNR:
             raise ValueError(
                 f"`log_snr` must be increasing and between -{MAX_LOG_SNR} and {MAX_LOG_SNR}, got {self.log_snr}"
@@ -169,11 +185,10 @@ class DenoisingModule(ConditionalDistribution):
     """Base class of the modules of `Diffusion` and `FlowMatching`.
 
     Its parameters are the location m (..., D), the scale s (..., D) and the features h (..., H). If all steps are
-    drawn jointly, a further parameter (B, T, 1) is 1 at observed steps, 0 at missing steps and -1 at padding. The
-    denoiser then has a density for the steps that are 1, and ignores all others.
+    drawn jointly, a further parameter (B, T, D) is 1 at observed entries, 0 at missing ones and -1 at padding. The
+    denoiser then has a density for the entries that are 1, and ignores all others.
     """
 
-    event_dim = 1
     location_scale = True
     centred = True
 
@@ -202,6 +217,7 @@ class DenoisingModule(ConditionalDistribution):
                 "use denoiser=None"
             )
         self.spec, self.joint_steps = spec, spec.joint
+        self.event_dim = 0 if spec.joint else 1
         self.denoiser: Any = spec.denoiser.build(shape) if spec.joint else StepDenoiser(spec.hidden, shape)
         self.hidden_features = nn.Parameter(torch.zeros(shape.features)) if spec.drop else None
 
@@ -209,8 +225,12 @@ class DenoisingModule(ConditionalDistribution):
         """Return the angle a (...) at times t (...) from 0, the data, to 1."""
         raise NotImplementedError
 
+    def sampler_angles(self, t: Tensor) -> Tensor:
+        """Return the angles (...) at which the sampler evaluates the denoiser, for t (...) from 1, noise, to 0."""
+        return self.angle(t)
+
     def score(self, parameters: Parameters, value: Tensor) -> Tensor:
-        """Return `log_prob` of the Pyro distribution, (...), for values (..., D)."""
+        """Return the contribution (..., D) of each entry of values (..., D) to `log_prob` of the Pyro distribution."""
         raise NotImplementedError
 
     @override
@@ -228,7 +248,7 @@ class DenoisingModule(ConditionalDistribution):
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         loc, scale, features, *steps = parameters
         spec, z = self.spec, noise
-        levels = self.angle(torch.linspace(1, 0, spec.steps + 1, dtype=loc.dtype, device=loc.device)).unbind()
+        levels = self.sampler_angles(torch.linspace(1, 0, spec.steps + 1, dtype=loc.dtype, device=loc.device)).unbind()
 
         def denoised(z: Tensor, angle: Tensor) -> Tensor:
             angle = angle.expand(self._level_shape(z))
@@ -292,7 +312,7 @@ class DenoisingModule(ConditionalDistribution):
     def exact_log_prob(self, parameters: Parameters, value: Tensor, steps: int, probes: int | None) -> ODEDensity:
         """Return the density by the probability-flow ODE, as `DenoisingDistribution.exact_log_prob` does."""
         loc, scale, features, *seen = parameters
-        counted = (seen[0] > 0).to(loc.dtype) if seen else torch.ones_like(loc[..., :1])
+        counted = (seen[0] > 0).to(loc.dtype) if seen else torch.ones_like(loc)
         event = 2 if self.joint_steps else 1
         if probes is None:
             probes = 0 if math.prod(value.shape[-event:]) <= EXACT_DIMENSION else 16
@@ -325,8 +345,6 @@ class DenoisingModule(ConditionalDistribution):
 class DiffusionModule(DenoisingModule):
     """Distribution module of `Diffusion`."""
 
-    density = "bound"
-
     def __init__(self, spec: Diffusion, shape: Shape):
         super().__init__(spec, shape)
         low, high = spec.log_snr
@@ -351,27 +369,45 @@ class DiffusionModule(DenoisingModule):
 
     @override
     def angle(self, t: Tensor) -> Tensor:
-        low, high = self.noise_range
         if self.spec.schedule == "learned":
-            return (torch.lerp(low, high, t) / 2).exp().atan()
-        return torch.lerp((low / 2).exp().atan(), (high / 2).exp().atan(), t)
+            return (torch.lerp(*self.noise_range, t) / 2).exp().atan()
+        low, high = self._shifted_range()
+        return (math.exp(-self.spec.shift / 2) * torch.lerp(low, high, t).tan()).atan()
+
+    @override
+    def sampler_angles(self, t: Tensor) -> Tensor:
+        low, high = ((end / 2 / RHO).exp() for end in self.noise_range)
+        return (torch.lerp(low, high, t) ** RHO).atan()
 
     def weight(self, t: Tensor) -> Tensor:
         """Return w = cot(a) da / dt at times t (...)."""
-        low, high = self.noise_range
         if self.spec.schedule == "learned":
+            low, high = self.noise_range
             return torch.sigmoid(-torch.lerp(low, high, t)) * (high - low) / 2
-        return ((high / 2).exp().atan() - (low / 2).exp().atan()) / self.angle(t).tan()
+        low, high = self._shifted_range()
+        double = torch.sin(2 * torch.lerp(low, high, t))  # of the angle without the shift
+        return 2 * (high - low) * self.angle(t).cos().square() / double
+
+    def _shifted_range(self) -> tuple[Tensor, Tensor]:
+        """Return the lowest and highest angle of the cosine schedule without its shift."""
+        low, high = ((end + self.spec.shift) / 2 for end in self.noise_range)
+        return low.exp().atan(), high.exp().atan()
+
+    @property
+    def density(self) -> str:  # type: ignore[override]
+        """ "loss" while the loss "velocity" is trained, else "bound"."""
+        return "loss" if self.training and self.spec.loss == "velocity" else "bound"
 
     @override
     def score(self, parameters: Parameters, value: Tensor) -> Tensor:
+        if self.density == "loss":
+            loc, scale, *others = parameters
+            _, v, guess, _ = self._estimate((loc.detach(), scale.detach(), *others), value)
+            return Normal(loc, scale).log_prob(value) - (v - guess).square()
         u, v, guess, times = self._estimate(parameters, value)
         signal = torch.sigmoid(-self.noise_range[0])  # cos^2 of the lowest angle
         constant = math.log(2 * math.pi) + 1 - signal - signal.log()
-        entries = (
-            self.weight(times) * guess * (2 * v - guess) - (signal * u.square() + constant) / 2 - parameters[1].log()
-        )
-        return entries.sum(-1)
+        return self.weight(times) * guess * (2 * v - guess) - (signal * u.square() + constant) / 2 - parameters[1].log()
 
 
 class FlowMatchingModule(DenoisingModule):
@@ -398,7 +434,7 @@ class FlowMatchingModule(DenoisingModule):
         _, v, guess, times = self._estimate(parameters, value)
         angle = self.angle(times)
         # the derivative of the path, e - u, is (sin a - cos a) z + (cos a + sin a) v
-        return -((angle.cos() + angle.sin()) * (v - guess)).square().sum(-1)
+        return -((angle.cos() + angle.sin()) * (v - guess)).square()
 
 
 class ODEDensity(NamedTuple):
@@ -411,8 +447,8 @@ class ODEDensity(NamedTuple):
 class DenoisingDistribution(TorchDistribution):
     """Distribution of values that a denoiser generates: batch shape (...), event shape (D,).
 
-    If all steps are drawn jointly, the batch shape is (B, T), and `log_prob` returns additive shares of one bound for
-    all steps, not conditional densities.
+    If all steps are drawn jointly, the batch shape is (B, T, D), and `log_prob` returns additive shares of one bound
+    for all entries, not conditional densities.
 
     Args:
         module: module of the distribution.
@@ -420,12 +456,23 @@ class DenoisingDistribution(TorchDistribution):
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    support = constraints.real_vector
     has_rsample = True
 
     def __init__(self, module: DenoisingModule, parameters: Parameters):
         self.module, self.parameters = module, parameters
-        super().__init__(parameters[0].shape[:-1], parameters[0].shape[-1:], validate_args=False)
+        shape = parameters[0].shape
+        end = len(shape) - module.event_dim
+        super().__init__(shape[:end], shape[end:], validate_args=False)
+
+    @constraints.dependent_property(is_discrete=False)
+    def support(self) -> constraints.Constraint:
+        """Real vectors, or real numbers if all steps are drawn jointly."""
+        return constraints.independent(constraints.real, self.module.event_dim)
+
+    def _shifted_range(self) -> tuple[Tensor, Tensor]:
+        """Return the lowest and highest angle of the cosine schedule without its shift."""
+        low, high = ((end + self.spec.shift) / 2 for end in self.noise_range)
+        return low.exp().atan(), high.exp().atan()
 
     @property
     def density(self) -> str:
@@ -433,9 +480,10 @@ class DenoisingDistribution(TorchDistribution):
         return self.module.density
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return what `density` declares, (...), for values (..., D); random."""
+        """Return what `density` declares, of the batch shape, for values (..., D); random."""
         shape = torch.broadcast_shapes(value.shape, self.batch_shape + self.event_shape)
-        return self.module.score(self._expanded(shape[:-1]), value.expand(shape))
+        entries = self.module.score(self._expanded(shape[:-1]), value.expand(shape))
+        return entries.sum(-1) if self.module.event_dim else entries
 
     def rsample(self, sample_shape: Any = ()) -> Tensor:
         """Return draws (*sample_shape, *batch_shape, D), differentiable with respect to the parameters."""
@@ -463,7 +511,8 @@ class DenoisingDistribution(TorchDistribution):
 
     def expand(self, batch_shape: Any, _instance: object = None) -> DenoisingDistribution:
         """Return the distribution with another batch shape."""
-        return DenoisingDistribution(self.module, self._expanded(torch.Size(batch_shape)))
+        shape = torch.Size(batch_shape) + self.event_shape
+        return DenoisingDistribution(self.module, self._expanded(shape[:-1]))
 
     def _expanded(self, batch_shape: torch.Size) -> Parameters:
         return tuple(each.expand(*batch_shape, each.shape[-1]) for each in self.parameters)

@@ -24,6 +24,7 @@ from ..distributions.diffusion import LEVEL_SIZE, DenoiserSpec, embed_level, sma
 from ..factorization.relations import ALL
 from .attention import SelfAttention
 from .base import Input, NetworkSpec
+from .loop import memoize
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Denoiser(DenoiserSpec):
 class SequenceDenoiser(nn.Module):
     """A network over time from noisy values, the level and features to estimates of v at all steps.
 
-    A frame of its input consists of the noisy value, the features, and an indicator of an observed step.
+    A frame of its input consists of the noisy value, the features, and an indicator of each observed entry.
 
     Args:
         spec: description of the denoiser.
@@ -82,40 +83,49 @@ class SequenceDenoiser(nn.Module):
     def __init__(self, spec: Denoiser, shape: Shape):
         super().__init__()
         self.basis, self.coefficients = spec.basis and BASES[spec.basis], spec.coefficients
-        frame = Input("frame", shape.size + shape.features + 1, shape.relation)
+        frame = Input("frame", 2 * shape.size + shape.features, shape.relation)
         self.network = spec.network.build([frame, Input("level", LEVEL_SIZE)], True, shape.size)
         self.out = small_linear(self.network.features, shape.size)
         if self.basis:
             self.log_scale = nn.Parameter(torch.zeros(shape.size))
             self.slope = nn.Parameter(torch.ones(shape.size))
 
-    def forward(self, z: Tensor, angle: Tensor, features: Tensor, steps: Tensor) -> Tensor:
-        """Return v (..., T, D) for z (..., T, D), angles (..., 1, 1), features (..., T, H) and steps (..., T, 1)."""
-        observed, others = torch.where(steps > 0, z, 0.0), torch.cat([features, (steps > 0).to(z.dtype)], -1)
-        others = torch.where(steps < 0, 0.0, others).flatten(0, -3)
-        lengths, observed = (steps >= 0).sum((-2, -1)).flatten(), observed.flatten(0, -3)
+    def forward(self, z: Tensor, angle: Tensor, features: Tensor, entries: Tensor) -> Tensor:
+        """Return v (..., T, D) for z (..., T, D), angles (..., 1, 1), features (..., T, H) and entries (..., T, D)."""
+        others, lengths, basis = memoize(self, [features, entries], lambda: self._given(features, entries))
+        observed = torch.where(entries > 0, z, 0.0).flatten(0, -3)
         level = embed_level(angle[..., 0, :]).flatten(0, -2)
-        if self.basis:
-            v = self._in_frequency(observed, angle.flatten(0, -3), others, lengths, level)
-        else:
+        if basis is None:
             v = self._network(torch.cat([observed, others], -1), level, lengths)
+        else:
+            v = self._in_frequency(observed, angle.flatten(0, -3), others, basis, level, lengths)
         reshaped: Tensor = v.unflatten(0, z.shape[:-2])
         return reshaped
+
+    def _given(self, features: Tensor, entries: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return what the network reads besides the noisy values, numbers of valid steps, and the basis if any."""
+        is_valid = entries[..., :1] >= 0
+        others = torch.cat([features, (entries > 0).to(features.dtype)], -1)
+        others, lengths = torch.where(is_valid, others, 0.0).flatten(0, -3), is_valid.sum((-2, -1)).flatten()
+        if not self.basis:
+            return others, lengths, None
+        basis = self.basis(lengths, others.shape[1], others.dtype)
+        return basis[:, : self.coefficients] @ others, lengths, basis
 
     def _network(self, frames: Tensor, level: Tensor, lengths: Tensor) -> Tensor:
         v: Tensor = self.out(self.network({"frame": frames, "level": level}, frames.shape[1], lengths))
         return v.to(frames.dtype)
 
-    def _in_frequency(self, z: Tensor, angle: Tensor, others: Tensor, lengths: Tensor, level: Tensor) -> Tensor:
-        assert self.basis
-        basis = self.basis(lengths, z.shape[1], z.dtype)
+    def _in_frequency(
+        self, z: Tensor, angle: Tensor, others: Tensor, basis: Tensor, level: Tensor, lengths: Tensor
+    ) -> Tensor:
         steps = torch.arange(1, z.shape[1] + 1, dtype=z.dtype, device=z.device)
         scale = (self.log_scale - self.slope * steps.log()[:, None]).exp()
         spread = (angle.cos() * scale).square() + angle.sin().square()
-        z, n = basis @ z, min(self.coefficients or z.shape[1], z.shape[1])
+        z, n = basis @ z, others.shape[1]
         v = angle.cos() * angle.sin() * (1 - scale.square()) / spread * z
         whitened = (z / spread.sqrt())[:, :n]
-        update = self._network(torch.cat([whitened, basis[:, :n] @ others], -1), level, lengths.clamp(max=n))
+        update = self._network(torch.cat([whitened, others], -1), level, lengths.clamp(max=n))
         update = (scale / spread.sqrt())[:, :n] * update
         return basis.mT @ torch.cat([v[:, :n] + update, v[:, n:]], 1)
 

@@ -192,6 +192,7 @@ class Reader:
             prefix={name: values[name] for name in prefix},
             groups=groups,
             grouped=self.grouped,
+            given=self.view.given,
         )
 
     def _extend_history(self, factorization: Factorization, values: dict[str, Any], length: int) -> None:

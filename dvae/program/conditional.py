@@ -229,14 +229,14 @@ class Conditional(nn.Module):
             groups: groups of sequences that share the child; features are averaged over each group.
         """
         if self.joint:
-            observed = self._observed_steps(parents.get(indicator(self.factor.child)), batch, length, lengths)
+            observed = self._observed_entries(parents.get(indicator(self.factor.child)), batch, length, lengths)
             return *self._forward(parents, batch, length, lengths, groups), observed
         return self._forward(parents, batch, length, lengths, groups)
 
-    def _observed_steps(self, mask: Tensor | None, batch: int, length: int, lengths: Tensor | None) -> Tensor:
-        """Return 1 at observed steps, 0 at missing steps and -1 at padding, (B, T, 1)."""
-        ones = like(self).new_ones(batch, length, 1)
-        observed = ones if mask is None else mask.all(-1, keepdim=True).to(ones)
+    def _observed_entries(self, mask: Tensor | None, batch: int, length: int, lengths: Tensor | None) -> Tensor:
+        """Return 1 at observed entries, 0 at missing ones and -1 at padding, (B, T, D)."""
+        ones = like(self).new_ones(batch, length, self.size)
+        observed = ones if mask is None else mask.to(ones)
         return observed if lengths is None else observed.where(valid_steps(lengths, length)[..., None], -ones)
 
     def _forward(

@@ -14,7 +14,8 @@ from pyro import poutine
 from torch import Tensor
 
 from ..data.batch import WHOLE, Batch
-from ..data.sequences import refuse_table
+from ..data.sequences import refuse_table, tensor_of
+from ..data.views import GIVEN
 from ..networks.loop import memoizing
 from ..options import Count, Range, require
 from .batch import AnyBatch, in_chunks, repeat, rows
@@ -41,6 +42,8 @@ def forecast(
     """
     require(Count, horizon=horizon, samples=samples)
     require(Annotated[int, Range(1)], chunk=chunk)
+    if model.view.given:
+        return _forecast_given(model, batch, horizon, samples, draw_emission, fix, chunk)
     data = model.read(batch)
     names: Any = batch if isinstance(batch, Mapping) else ()
     redrawn = [name for name in model.shared if name not in names]  # drawn for each sample
@@ -96,6 +99,30 @@ def forecast(
     distinct = samples if model.latents or model.summed or redrawn or draw_data else 1
     out = in_chunks(futures, size, distinct, _chunk_size(model, data, size, chunk))
     return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
+
+
+def _forecast_given(
+    model: Any,
+    batch: AnyBatch,
+    horizon: int,
+    samples: int,
+    draw_emission: bool | None,
+    fix: Mapping[str, Tensor] | None,
+    chunk: int,
+) -> dict[str, Tensor]:
+    """Impute the steps after a batch, given its observed entries (`views.Given`)."""
+    refuse_table(batch)
+    values = Batch(batch if isinstance(batch, Mapping) else {WHOLE: batch})
+    if fix or values.lengths is not None:
+        raise ValueError(
+            f"{model.generative} forecasts sequences of one length, without fixed values; remove "
+            f"{'`fix`' if fix else 'lengths'}"
+        )
+    x = tensor_of(values[WHOLE])
+    mask = torch.ones_like(x, dtype=torch.bool) if values.mask() is None else tensor_of(values.mask())
+    future = x.new_zeros(len(x), horizon, x.shape[2])
+    whole = values | {WHOLE: torch.cat([x, future], 1), "mask": torch.cat([mask, future.bool()], 1)}
+    return {WHOLE: model.impute(whole, samples, draw=draw_emission, chunk=chunk)[WHOLE][:, :, x.shape[1] :]}
 
 
 def _fixed_values(model: Any, values: Mapping[str, Tensor], data: Batch, size: int, horizon: int) -> dict[str, Tensor]:
@@ -185,10 +212,11 @@ def impute(
     masks = values.masks(WHOLE if model.view.parts else model.observed[0])
     if not masks:
         raise ValueError("this batch has no missing entries; give a 'mask' that is False at the entries to fill")
-    if joint := [name for name in model.observed if model.generator[name].joint]:
+    joint = [name for name in model.observed if model.generator[name].joint]
+    if joint and not model.view.given:
         raise ValueError(
             f"all steps of {', '.join(joint)} are drawn jointly, and not given the observed ones, so they cannot be "
-            "imputed; use a distribution of single steps"
+            "imputed; make the given entries context (dvae.data.views.Given), or use a distribution of single steps"
         )
     drawing = model.is_drawn() if draw is None else draw
     exact = model.likelihood and not model.bounded
@@ -197,11 +225,12 @@ def impute(
             f"particles must be at least 1, and more than 1 require draws (draw=True) and a likelihood, which "
             f"{model.generative} {'has' if exact else 'does not have'}; got {particles} and draw={drawing}"
         )
-    draws = (
-        _impute_draws(model, batch, samples, chunk, particles)
-        if drawing
-        else model.reconstruct(batch, samples, chunk=chunk)
-    )
+    if model.view.given:
+        draws = _impute_given(model, values, samples, chunk, drawing)
+    elif drawing:
+        draws = _impute_draws(model, batch, samples, chunk, particles)
+    else:
+        draws = model.reconstruct(batch, samples, chunk=chunk)
     filled = {}
     for name, mask in masks.items():
         value = draws[name]
@@ -236,6 +265,21 @@ def _impute_draws(model: Any, batch: AnyBatch, samples: int, chunk: int, particl
     if particles == 1:
         return in_chunks(draws, run.batch, samples, _chunk_size(model, data, run.batch, chunk))
     return _resample(draws, run.batch, samples, particles, chunk, groups)
+
+
+def _impute_given(model: Any, batch: Batch, samples: int, chunk: int, drawing: bool) -> dict[str, Tensor]:
+    """Return draws or means of x given all its observed entries (`views.Given`)."""
+    name, mask = model.observed[0], torch.as_tensor(batch.mask())
+    read = model.read(batch | {GIVEN: mask})
+    missing = ~mask.to(read[name].device)
+    data = Batch({n: v for n, v in read.items() if n != name} | {"mask": {name: missing}})
+    data.reader = read.reader
+
+    def draws(part: slice, count: int) -> dict[str, Tensor]:
+        out = model.model(repeat(rows(data, part), count), length=mask.shape[1], mean_emission=not drawing)
+        return model.to_data_space({name: out[name].unflatten(0, (count, -1))}, rows(data, part))  # type: ignore[no-any-return]
+
+    return in_chunks(draws, len(mask), samples, chunk)
 
 
 def _resample(

@@ -747,7 +747,10 @@ class DynamicalVAE(nn.Module):
             ValueError: if a latent is missing or has the wrong shape, or a variable has a loss instead of a density.
         """
         if losses := [name for name in self.observed if self.generator[name].head.density == "loss"]:
-            raise ValueError(f"{', '.join(losses)} has a loss instead of a density, so the model has no log joint")
+            advice = "; a Diffusion has a bound in evaluation mode (model.eval())" if self.training else ""
+            raise ValueError(
+                f"{', '.join(losses)} has a loss instead of a density, so the model has no log joint{advice}"
+            )
         if missing := [name for name in self.latents if name not in latents]:
             raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
         for name, value in latents.items():

@@ -206,6 +206,7 @@ class Rollout:
         grouped: names of static latents that groups share.
         sums: structure of the sum over discrete latents, if there are any.
         states: dictionary from discrete latent to drawn values, which draws of its readers use and densities ignore.
+        given: name of the context of given entries (`views.Given`), if there is one.
     """
 
     factorization: Factorization
@@ -226,6 +227,7 @@ class Rollout:
     grouped: Collection[str] = ()
     sums: EnumerationPlan | None = None
     states: dict[str, Tensor] = field(default_factory=dict)
+    given: str | None = None
 
     def __post_init__(self) -> None:
         _check_custom_masks(self.factorization, self.length)
@@ -440,8 +442,13 @@ class Rollout:
 
     @cached_property
     def hidden(self) -> dict[str, Hidden]:
-        """Data entries that the model may not read: missing ones, and frames that scheduled sampling replaces."""
-        masks = {name: mask for name, mask in self.observed.items() if name in self.values}
+        """Data entries that the model may not read: missing ones, and frames that scheduled sampling replaces.
+
+        Without variables whose steps are drawn jointly and that no variable reads, since they need no means.
+        """
+        read = {parent for each in self.conditionals.values() for parent in each.parents}
+        unread = {name for name, each in self.conditionals.items() if each.joint} - read
+        masks = {name: mask for name, mask in self.observed.items() if name in self.values and name not in unread}
         missing = {name: ~mask for name, mask in masks.items() if is_deferring() or not mask.all()}
         hidden = {name: Hidden(entries) for name, entries in missing.items()}
         if not isinstance(self.feeding, ScheduledSampling) or not self.feeding.active:

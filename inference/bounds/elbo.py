@@ -45,7 +45,7 @@ class Terms:
             volume.
         kl: KL (B,) of each latent, summed over the steps of a local one.
         energies: energy (B,) of each penalty (a `pyro.factor` site), positive if it costs.
-        n_steps: number of valid steps, (B,).
+        n_steps: number of valid steps, (B,), without those whose entries are all given (`views.Given`).
         steps: log-likelihood or KL by step (B, T) of each local variable, 0 at padding.
         bounded: names of the variables whose term has a stochastic bound in place of a log density
             (`distributions.Diffusion`). `bound` remains a lower bound. The terms of single steps of a variable that is
@@ -317,8 +317,13 @@ def _record(terms: Terms, table: dict[str, Tensor], name: str, value: Tensor, ru
 def _valid_steps(rollout: Rollout) -> Tensor:
     reference, rows = like(next(iter(rollout.conditionals.values()))), rollout.batch // rollout.draws
     if rollout.lengths is None:
-        return reference.new_full((rows,), float(rollout.length))
-    return rollout.lengths[:rows].to(reference.dtype)
+        steps = reference.new_full((rows,), float(rollout.length))
+    else:
+        steps = rollout.lengths[:rows].to(reference.dtype)
+    if rollout.given is None:
+        return steps
+    is_given = rollout.values[rollout.given][:rows].chunk(2, -1)[1].all(-1)
+    return (steps - is_given.sum(-1)).clamp(min=1.0)
 
 
 def _mean(draws: list[Terms]) -> Terms:

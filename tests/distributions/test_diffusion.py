@@ -42,9 +42,9 @@ def build(spec, denoiser=optimal):
     return module, parameters
 
 
-@pytest.mark.parametrize("schedule", ["learned", "cosine"])
-def test_the_bound_of_normal_data_is_tight(schedule):
-    module, parameters = build(Diffusion(schedule=schedule))
+@pytest.mark.parametrize(("schedule", "shift"), [("learned", 0.0), ("cosine", 0.0), ("cosine", 1.5)])
+def test_the_bound_of_normal_data_is_tight(schedule, shift):
+    module, parameters = build(Diffusion(schedule=schedule, shift=shift))
     x = DATA.sample((500_000,))
     gap = (DATA.log_prob(x) - module.distribution(parameters(len(x))).log_prob(x)).detach() / 2
     error = gap.std() / math.sqrt(len(x))
@@ -116,7 +116,23 @@ def bimodal(n):
     return signs + 0.1 * torch.randn(n, 1, 1)
 
 
-@pytest.mark.parametrize("spec", [Diffusion(hidden=(32, 32)), FlowMatching(hidden=(32, 32))])
+VELOCITY = Diffusion(hidden=(32, 32), schedule="cosine", loss="velocity")
+
+
+def test_the_loss_of_v_trains_location_and_scale_by_the_normal_density():
+    module = VELOCITY.build(Shape(2, 3)).double()
+    features, x = torch.randn(6, 3, dtype=torch.float64), torch.randn(6, 2, dtype=torch.float64)
+    gradients = []
+    for density in (
+        module.distribution,
+        lambda p: torch.distributions.Independent(torch.distributions.Normal(*p[:2]), 1),
+    ):
+        gradients.append(torch.autograd.grad(density(module(features)).log_prob(x).sum(), module.out.weight)[0])
+    torch.testing.assert_close(*gradients)
+    assert (module.train().density, module.eval().density) == ("loss", "bound")
+
+
+@pytest.mark.parametrize("spec", [Diffusion(hidden=(32, 32)), VELOCITY, FlowMatching(hidden=(32, 32))])
 def test_training_keeps_the_mass_of_both_modes(spec):
     model = dvae.DynamicalVAE("p(x_t)", "", {"x": 1}, distributions={"p(x)": spec})
     optimiser = torch.optim.Adam(model.parameters(), lr=4e-3)
@@ -127,7 +143,7 @@ def test_training_keeps_the_mass_of_both_modes(spec):
         (-head.distribution(head(torch.empty(512, 0))).log_prob(bimodal(512)[:, 0]).mean()).backward()
         optimiser.step()
         schedule.step()
-    draws = model.sample(2000, length=1)["x"].flatten()
+    draws = model.eval().sample(2000, length=1)["x"].flatten()
     assert (draws < 0).float().mean() == pytest.approx(0.3, abs=0.05)
     assert ((draws.abs() - 1).abs() < 0.4).float().mean() > 0.95
     x = bimodal(400)
@@ -436,6 +452,8 @@ def test_a_loss_is_an_energy_and_has_no_bound():
     [
         (lambda: Diffusion(steps=0).build(Shape(2)), "`steps` of at least 1"),
         (lambda: Diffusion(schedule="linear").build(Shape(2)), "schedule"),
+        (lambda: Diffusion(shift=1.0).build(Shape(2)), "a learned schedule has none"),
+        (lambda: Diffusion(loss="velocity").build(Shape(2)), "'velocity' with schedule='cosine'"),
         (lambda: Diffusion(log_snr=(3.0, 1.0)).build(Shape(2)), "increasing"),
         (lambda: Diffusion(guidance=2.0).build(Shape(2, 1)), "set `drop` above 0"),
         (lambda: Diffusion(drop=0.1).build(Shape(2)), "no parents"),

@@ -33,6 +33,7 @@ SMALL = {
     "hit-dvae": {"samples": 2, "width": 8, "heads_count": 2, "decoder": 8, "pose_width": 2, "pose_prior": 0.0},
     "gsps": {"width": 8, "blocks": 1, "draws": (2, 2), "coefficients": 4, "pose_prior": 0.0},
     "denoiser": {"width": 8, "heads_count": 2, "layers": 1, "coefficients": 4, "sampler_steps": 2},
+    "csdi": {"width": 8, "heads_count": 2, "layers": 1, "sampler_steps": 2},
     "trajevae": {"width": 8, "feedforward": 8, "components": 4, "layers": 1},
     "erd": {"width": 4, "encoder": (5,), "decoder": (6,)},
     "aclstm": {"width": 4},

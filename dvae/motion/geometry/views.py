@@ -196,6 +196,13 @@ class Bones(View):
             joints = joints + directions[..., self.skeleton.root, None, :]
         return self._replace_x(data, self._with_root(joints, data[WHOLE]))
 
+    def with_lengths(self, x: Tensor, like: Tensor) -> Tensor:
+        """Return poses x (K, B, T, D) with the mean bone lengths of other poses (B, O, D)."""
+        lengths = self.skeleton.limbs(like).norm(dim=-1).mean(1)
+        limbs = self.skeleton.limbs(x)
+        directions = self._with_root(limbs * inverse_lengths(limbs)[..., None], x)
+        return torch.stack([self.inverse(Batch({WHOLE: each, LENGTHS: lengths}))[WHOLE] for each in directions])
+
     @override
     def log_det(self, data: Batch) -> Tensor:
         raise ValueError(

@@ -41,7 +41,7 @@ class TestDenoiser(FactorizationContract):
     missing: ClassVar = {}
 
     def build(self, size):
-        model = small().build({"x": size})
+        model = small(loss="bound").build({"x": size})
         model.generator["x"].head.perturb = lambda u: (torch.full_like(u[..., :1, :1], 0.4), (3 * u).sin())
         return model
 
@@ -72,10 +72,29 @@ def test_the_future_is_relative_to_the_last_pose_and_the_view_keeps_its_volume(w
     assert torch.equal(model.read(past_of(batch))["h"], data["h"])
 
 
-def test_its_score_is_labelled_a_bound(windows):
-    model = built(windows)
+def test_its_score_is_labelled_a_bound_and_its_loss_an_energy(windows):
+    model, batch = built(windows), batch_of(windows)
     assert model.bounded == ("x",)
-    assert dvae.SequenceELBO().terms(model, batch_of(windows)).bounded == ("x",)
+    assert dvae.SequenceELBO().terms(model, batch).bounded == ("x",)
+    terms = dvae.SequenceELBO().terms(model.train(), batch)
+    assert set(terms.energies) == {"x"}
+    assert not model.likelihood
+    with pytest.raises(ValueError, match=r"model\.eval"):
+        model.log_joint(batch, {})
+
+
+def test_bones_keep_their_observed_lengths(windows):
+    batch = batch_of(windows)
+    torch.manual_seed(1)
+    free = built(windows, bones=False).forecast(past_of(batch), 7, 2)["x"]
+    torch.manual_seed(1)
+    kept = built(windows).forecast(past_of(batch), 7, 2)["x"]
+    skeleton = windows.skeleton
+    lengths = skeleton.limbs(past_of(batch)["x"]).norm(dim=-1).mean(1, keepdim=True)
+    torch.testing.assert_close(skeleton.limbs(kept).norm(dim=-1), lengths.expand(2, 3, 7, -1))
+    assert (skeleton.limbs(free).norm(dim=-1) - lengths).abs().max() > 0.001
+    directions = [torch.nn.functional.normalize(skeleton.limbs(each), dim=-1) for each in (free, kept)]
+    torch.testing.assert_close(*directions)
 
 
 @pytest.mark.parametrize("options", [{}, {"coefficients": 0, "sampler": "ancestral"}, {"drop": 0.2, "guidance": 1.5}])
@@ -125,7 +144,7 @@ def test_futures_keep_the_mass_of_both_modes():
     torch.manual_seed(0)
     method = small(width=32, layers=2, sampler_steps=15)
     model = method.build({"x": 1})
-    recipe = method.train(dvae.data.sequences.Sequences({"x": x}), steps=800)
+    recipe = method.train(dvae.data.sequences.Sequences({"x": x}), steps=1200)
     dvae.fit(model, recipe, batch_size=64, learning_rate=3e-3, decay=0.5, progress=False, accelerator="cpu")
     past = x[:50, :2]
     ends = (model.eval().forecast({"x": past}, 6, 40)["x"][:, :, -1] - past[:, -1]).flatten()
