@@ -225,7 +225,7 @@ def gap(
 
 
 def coverage(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     data: str | None = None,
     missing: Expert[Missing] = False,
     failed: Expert[Failed] = False,
@@ -241,12 +241,13 @@ def coverage(
     """Widen a run's forecasts to bands that contain whole futures with a given probability, and test them.
 
     Calibrates on the validation windows, which also selected the weights, and tests on the test windows. With --label
-    style --values feminine it calibrates on the test clips of these styles and tests on the others. Prints the factors
-    and the coverage before and after. Writes coverage.json and coverage-test.json in the run, or to --out.
+    style --values feminine it calibrates on the test clips of these styles and tests on the others. With runs of a
+    backtest it calibrates on the windows between their cutoffs and tests on those after the last one. Prints the
+    factors and the coverage before and after. Writes coverage.json and coverage-test.json in the last run, or to --out.
     `dvae.PredictionBands.load` reads the first, and its `apply` returns the band of forecasts.
 
     Args:
-        run: the run directory.
+        run: the run directory; or runs of one method at several cutoffs, such as backtest/cutoff-*/srnn-seed0.
         data: where the data are now, if the path in the run is no longer valid; or other data with the same variables.
         level: share of futures that bands contain.
         label: label of test clips that divides them into those for calibration and those for the test.
@@ -261,14 +262,54 @@ def coverage(
     check_files(out, figure, ".json")
     if bool(values) != (label is not None):
         raise UsageError("--label and --values select the test clips for calibration; give both")
-    loaded, data_set = loading.forecaster(run, data, missing, failed)
-    calibration_windows, test_windows = _calibration_and_test(loaded, data_set, label, values)
-    bands = conformal_bands(loaded.model, calibration_windows, level, samples=samples, seed=seed, batch_size=batch_size)
-    path = out or run / f"{loading.record('coverage', loaded, data_set)}.json"
+    if not run:
+        raise UsageError("give at least one run directory")
+    loaded_runs = [loading.forecaster(each, data, missing, failed) for each in run]
+    loaded, data_set = min(loaded_runs, key=lambda pair: _test_steps(pair[0]))
+    if len(loaded_runs) > 1:
+        calibration_models, calibration_windows = _between_cutoffs(loaded_runs, label)
+        test_windows = data_set.windows("test")
+    else:
+        calibration_models = loaded.model
+        calibration_windows, test_windows = _calibration_and_test(loaded, data_set, label, values)
+    bands = conformal_bands(
+        calibration_models, calibration_windows, level, samples=samples, seed=seed, batch_size=batch_size
+    )
+    path = out or loaded.path / f"{loading.record('coverage', loaded, data_set)}.json"
     save_and_print(bands, [path], figure)
     save_and_print(
         bands.coverage({loaded.method.name: loaded.model}, test_windows), [path.with_stem(f"{path.stem}-test")], None
     )
+
+
+def _test_steps(run: runs.Loaded) -> int:
+    """Return the number of steps after the cutoff of a run; 0 if it has no cutoff."""
+    return run.schema.cut.test_steps if run.config.kind == "panel" else 0
+
+
+def _between_cutoffs(loaded_runs: Sequence[tuple[runs.Loaded, Any]], label: str | None) -> tuple[list[Any], list[Any]]:
+    """Return models and the windows between their cutoff and the next one whose futures end by the last cutoff.
+
+    Raises:
+        UsageError: the runs are not of one method and seed at several cutoffs of a table, or there is no such window.
+    """
+    ordered = sorted(loaded_runs, key=lambda pair: _test_steps(pair[0]), reverse=True)
+    steps = [_test_steps(run) for run, _ in ordered]
+    fits = {(run.method.name, run.config.training.seed, data.fingerprint) for run, data in ordered}
+    if label is not None or len(fits) > 1 or len({*steps, 0}) <= len(steps):
+        raise UsageError(
+            "several runs calibrate bands over cutoffs of a table; give runs of one method and seed, each at another "
+            "cutoff, such as backtest/cutoff-*/srnn-seed0, without --label"
+        )
+    origin, models, windows = ordered[-1][1].windows("test").origins[:, 0].min(), [], []
+    for (run, data), now, following in zip(ordered, steps, steps[1:], strict=False):
+        between = data.following(now - following)
+        if places := (between.origins[:, 1] <= origin).nonzero().flatten().tolist():
+            models.append(run.model)
+            windows.append(between.subset(places))
+    if not windows:
+        raise UsageError("no future after an earlier cutoff ends by the last cutoff; give runs at earlier cutoffs")
+    return models, windows
 
 
 def _calibration_and_test(run: runs.Loaded, data_set: Any, label: str | None, values: Sequence[str]) -> Any:

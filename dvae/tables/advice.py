@@ -55,6 +55,7 @@ def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
     return [
         *_spikes(columns, values),
         *_split(panel, cut, guessed),
+        *_season(panel, cut),
         *(() if panel.columns.lags else _absent(times)),  # with lags, the schema warns
         *dated,
         *_leaks(*compared),
@@ -103,6 +104,15 @@ def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:
             yield f'{reason}; set split = "time" in [cut], with observed and horizon (--split time)'
         elif cut.split == "time" and guessed:
             yield f'the proposed split is by time: {reason}; split = "sequence" tests new sequences instead'
+
+
+def _season(panel: Panel, cut: Cut) -> Iterator[str]:
+    usual = panel.calendar.usual_season
+    if cut.season is None and 0 < usual <= (cut.observed or 0):
+        yield (
+            "models are not compared with a seasonal forecast, because no season is given; with such dates it is often "
+            f"{usual}: season = {usual} in [cut] (--season {usual})"
+        )
 
 
 def _absent(times: Sequence[np.ndarray]) -> Iterator[str]:

@@ -35,6 +35,8 @@ days would need 24, 12 or 366 coefficients, more than short tables determine.
 HARMONICS = 2
 FLAG = 20
 """Maximum number of distinct values of a flag or category."""
+USUAL_SEASONS = {"1D": 7, "1B": 5, "1MS": 12, "1ME": 12, "1BMS": 12, "1BME": 12}
+"""Steps in a week of daily data, and in a year of monthly data."""
 LINEAR = 1e-5
 """Distance from 1 of the correlation with time, below which a column is a linear function of it."""
 _OFFSET = re.compile(r"(?:UTC)?[-+](?:[01]\d|2[0-3]):[0-5]\d", re.ASCII)
@@ -75,6 +77,12 @@ class Calendar:
         unit = "" if self.kind == "numbers" else " s"
         step = f" by {self.step or f'{self.gap:g}{unit}'}" if self.step or self.gap else ""
         return self.kind + step + (f", {self.zone}" if self.zone else "")
+
+    @property
+    def usual_season(self) -> int:
+        """Number of steps in a week of daily, a day of hourly, or a year of monthly dates; 0 for other times."""
+        hourly = self.kind == "dates" and self.step is None and self.gap == HOUR
+        return 24 if hourly else USUAL_SEASONS.get(self.step or "", 0)
 
     def stepping(self, times: Iterable[np.ndarray | None]) -> Self:
         """Return the calendar with the most common calendar step of sequences of times, and their median gap."""

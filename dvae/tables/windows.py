@@ -195,6 +195,11 @@ class PanelWindows:
         return {**entries, "title": [self.panel.name, self.split]}
 
     @property
+    def usual_season(self) -> int:
+        """Usual season of tables with these steps, as `Calendar.usual_season`."""
+        return self.panel.calendar.usual_season
+
+    @property
     def families(self) -> list[str]:
         """Family of each coordinate of x."""
         return [column.family for column in self.schema.columns.targets for _ in column.coordinates]

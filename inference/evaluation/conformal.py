@@ -365,10 +365,10 @@ def conformal_bands(
     clusters = int(places.max()) + 1 if origins is None else len(origins[:, 0].unique())
     if clusters < required:
         unit, highest = f"{cluster}s" if groups is None else "groups", math.floor(100 * clusters / (clusters + 1))
-        unit = unit if origins is None else "origins"
+        unit, more = (unit, "more") if origins is None else ("origins", "more, such as those of several cutoffs")
         raise ValueError(
             f"prediction bands of {100 * level:g} % need at least {required} {unit} of calibration windows, got "
-            f"{clusters}; use more, or a level of at most {highest} %"
+            f"{clusters}; use {more}, or a level of at most {highest} %"
         )
     with progress_bar(progress) as bar:
 

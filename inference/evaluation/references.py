@@ -236,7 +236,10 @@ class References:
 
     @property
     def notes(self) -> Iterator[str]:
-        """Note on exponential smoothing, if it is left out."""
+        """Notes on exponential smoothing and the seasonal reference of a table, if they are left out."""
+        usual = getattr(self.held.windows, "usual_season", 0)
+        if "seasonal" in self._defaults and self._period is None and 0 < usual <= self.held.observed:
+            yield f"seasonal was left out: it needs a season, which is often {usual} for such steps (--season {usual})"
         if "ETS" in self._defaults and self._source is not None and (needed := self.missing_requirement("ETS")):
             yield f"ETS was left out: it needs {needed}"
 

@@ -197,6 +197,29 @@ def test_a_backtest_by_the_command_line(frame, tmp_path, capsys):
     assert Backtest.load(out / "backtest.json").to_json() == stored.to_json()
 
 
+def test_bands_are_calibrated_between_cutoffs_by_the_command_line(frame, data, tmp_path, capsys):
+    table = tmp_path / "shops.csv"
+    frame.to_csv(table, index=False)
+    paths = {steps: tmp_path / f"before-{steps}" for steps in (3, 9, 12, 7)}
+    for steps, path in paths.items():
+        options = ["--split", "time", "--test", str(steps), "--observed", "6", "--horizon", "3", "--steps", "2"]
+        assert main(["fit", "autoregressive", "--data", str(table), "--out", str(path), *options]) == 0
+    command = ["check", "coverage", *map(str, paths.values())]
+    assert main([*command, "--samples", "20", "--level", "0.75"]) == 0
+    assert "which adapt over the origins" in " ".join(capsys.readouterr().out.split())
+    bands = dvae.PredictionBands.load(paths[3] / "coverage.json")
+    # The window that begins 4 steps before the end would reveal the steps after the last cutoff.
+    windows = [data.before(steps).following(horizon) for steps, horizon in ((12, 3), (9, 2), (7, 1))]
+    models = [dvae.load(paths[steps]).model for steps in (12, 9, 7)]
+    expected = dvae.conformal_bands(models, windows, 0.75, samples=20, progress=False)
+    assert (bands.clusters, bands.data["windows"]) == (3, 12)  # the third series has ended
+    assert bands.factors["number"] == pytest.approx(expected.factors["number"], rel=1e-4)
+    assert dvae.Evaluation.load(paths[3] / "coverage-test.json").data["windows"] == 4
+    for wrong in ([str(paths[9])], ["--label", "shop", "--values", "s1"]):  # a cutoff twice, and labels
+        assert main([*command, *wrong]) == 2
+        assert "each at another cutoff" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

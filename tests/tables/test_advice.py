@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+import dvae
 from dvae.cli import main
-from dvae.tables import Column, Columns, Cut, Panel, PanelData, Series
+from dvae.tables import Column, ColumnHints, Columns, Cut, Panel, PanelData, Series
 from dvae.tables.advice import findings, is_aligned
 from dvae.tables.calendar import Calendar
 from dvae.tables.column_inference import infer_columns
@@ -23,6 +24,27 @@ def found(values, columns=None, cut=None, times=None, guessed=False, kind="dates
     steps = DAY * np.arange(values.shape[1]) if times is None else times
     panel = Panel([Series(str(n), x, steps) for n, x in enumerate(values)], Columns(columns), "table", Calendar(kind))
     return findings(panel, cut or Cut(3, 1, split="time"), guessed)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "observed", "season"), [("D", 7, 7), ("D", 6, 0), ("h", 30, 24), ("MS", 12, 12), ("W", 60, 0)]
+)
+def test_a_missing_season_is_named_by_findings_and_evaluations(frequency, observed, season):
+    times = pd.date_range("2020-01-01", periods=150, freq=frequency)
+    frame = pd.DataFrame({"time": times, "y": noise(150)})
+    data = PanelData.of(frame, ColumnHints(("y",), time="time"), Cut(observed, 2, split="time"))
+    option = f"(--season {season})"
+    for texts in (
+        findings(data.panel, data.protocol, False),
+        dvae.evaluate({}, data.windows("test"), samples=5, progress=False).notes,
+    ):
+        assert sum("season" in text for text in texts) == sum(option in text for text in texts) == bool(season)
+    if season:
+        seasonal = data.recut(season=season)
+        assert not any("season" in text for text in findings(data.panel, seasonal.protocol, False))
+        scores = dvae.evaluate({}, seasonal.windows("test"), samples=5, progress=False)
+        assert "seasonal" in scores.rows
+        assert not any("season" in note for note in scores.notes)
 
 
 def noise(*shape):
@@ -157,10 +179,19 @@ def test_functions_of_the_date_are_proposed_as_known(tmp_path, capsys):
 
 
 NOTES = {
-    ("ggplot2", "txhousing"): ["by time", "'date' is a function of the time", "of 'sales' by a factor"],
+    ("ggplot2", "txhousing"): [
+        "by time",
+        "(--season 12)",
+        "'date' is a function of the time",
+        "of 'sales' by a factor",
+    ],
     ("gapminder", "gapminder"): ["by time", "of 'pop' by a factor"],
     ("survival", "pbcseq"): ["72% of 'edema' are 0 (rounding = 0.5", "'bili' by a factor"],
-    ("modeldata", "Chicago"): ["90% of 'gust' are 0", "'Clark_Lake' equals 'ridership' 14 steps before"],
+    ("modeldata", "Chicago"): [
+        "90% of 'gust' are 0",
+        "(--season 7)",
+        "'Clark_Lake' equals 'ridership' 14 steps before",
+    ],
 }
 """Words of each note about public tables."""
 

@@ -322,7 +322,7 @@ def test_bands_of_a_split_by_time_state_what_they_need(panel):
     windows = data.windows("validation")
     few = windows.subset([n for n, (_, _, start) in enumerate(windows.keys) if start < windows.keys[0][2] + 3])
     count = len(few.origins[:, 0].unique())
-    with pytest.raises(ValueError, match=f"need at least 9 origins .* got {count}; use more, or a level of at most"):
+    with pytest.raises(ValueError, match=f"need at least 9 origins .* got {count}; use more, such as .*, or a level"):
         conformal_bands(model, few, samples=5, progress=False)
     with pytest.raises(ValueError, match="`groups` only if they are not divided by time"):
         conformal_bands(model, windows, groups=["a"] * len(windows))
