@@ -207,7 +207,7 @@ def functions_of_time(
         if n_levels < 2:
             continue
         arguments[name] = next((key for key, part in keys.items() if _is_function(x, part[known], t)), "")
-        if _is_linear(x, t, owners[known]) or (keys and (x == local.year[known]).all()):
+        if _is_linear(x, t, owners[known]) or (keys and len(np.unique(x - local.year[known])) == 1):
             arguments[name] = "time"
         elif not arguments[name] and n_levels <= FLAG and _is_function(x, t, owners[known]):
             arguments[name] = "date"

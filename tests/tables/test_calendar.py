@@ -242,10 +242,11 @@ def test_functions_of_the_time_are_found_and_others_are_not():
     }
     values = {name: np.asarray(each, float) for name, each in (functions | others).items()}
     values["year"] = np.asarray(dates.year, float)
+    values["age"] = values["year"] - 1980
     values["weekday"][5:50] = np.nan
     owners = np.repeat([0, 1], 800)
     found = functions_of_time(values, seconds(pd.DatetimeIndex(frame.date)), Calendar("dates"), owners)
-    expected = {name: name for name in functions} | {"weekend": "weekday", "year": "time"}
+    expected = {name: name for name in functions} | {"weekend": "weekday", "year": "time", "age": "time"}
     assert found == expected
     single = {name: each[:800] for name, each in values.items()}
     found = functions_of_time(single, seconds(pd.DatetimeIndex(frame.date[:800])), Calendar("dates"), owners[:800])
