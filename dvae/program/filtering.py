@@ -338,7 +338,8 @@ class Filter:
             raise ValueError("an update continues all sequences by the same steps; leave out 'lengths' and 'group'")
         if static := [name for name in batch if not model.reader.local.get(name, True)]:
             raise ValueError(f"static variables were given with the first steps; leave out {', '.join(static)}")
-        new = Batch(batch).map(lambda value: value[:, None] if (value := torch.as_tensor(value)).dim() == 2 else value)
+        tensors = Batch(batch).map(lambda value: torch.as_tensor(value).clone())  # the caller may reuse its tensors
+        new = tensors.map(lambda value: value[:, None] if value.dim() == 2 else value)
         data: Batch = model.read({**self.engine.known.values, **new})
         _require_names(data, names)
         return data

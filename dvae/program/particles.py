@@ -180,10 +180,10 @@ class Particles:
             names: names of data or context.
         """
         for name in names:
-            observed: Tensor | None = None  # values and masks are copied, since the caller may reuse their tensors
-            self.data[name][self.position] = pick(run.values[name][:, t].clone(), self.sequence)
+            observed: Tensor | None = None
+            self.data[name][self.position] = pick(run.values[name][:, t], self.sequence)
             if name in run.observed and not run.observed[name][:, t].all():
-                observed = pick(run.observed[name][:, t].clone(), self.sequence)
+                observed = pick(run.observed[name][:, t], self.sequence)
             self.data[indicator(name)][self.position] = observed
         for name, present in run.present.items():
             self.data[presence(name)][self.position] = pick(present[:, t], self.sequence)

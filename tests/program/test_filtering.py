@@ -600,8 +600,9 @@ def test_a_file_that_is_no_filter_is_refused(tmp_path):
 @torch.no_grad()
 def test_a_caller_may_reuse_the_tensor_of_an_update():
     x, results, buffer = torch.randn(1, 6, 3, dtype=DOUBLE), [], torch.empty(1, 3, dtype=DOUBLE)
+    model = pair_model("vrnn")
     for reuses in (True, False):
-        stream = pair_model("vrnn").filter(x[:, :1], 8, seed=0)
+        stream = model.filter(x[:, :1], 8, seed=0)
         for t in range(1, 6):
             buffer.copy_(x[:, t])
             last = stream.update(buffer if reuses else buffer.clone())
