@@ -403,7 +403,8 @@ class DiffusionModule(DenoisingModule):
         if self.density == "loss":
             loc, scale, *others = parameters
             _, v, guess, _ = self._estimate((loc.detach(), scale.detach(), *others), value)
-            return Normal(loc, scale).log_prob(value) - (v - guess).square()
+            normal = Normal(loc, scale, validate_args=False)  # without reading values of a GPU
+            return normal.log_prob(value) - (v - guess).square()
         u, v, guess, times = self._estimate(parameters, value)
         signal = torch.sigmoid(-self.noise_range[0])  # cos^2 of the lowest angle
         constant = math.log(2 * math.pi) + 1 - signal - signal.log()
