@@ -78,6 +78,8 @@ class ConditionalDistribution(nn.Module):
     """Whether the variable is a function of its parents, so that it has no density."""
     density: Literal["exact", "bound", "loss"] = "exact"
     """What `log_prob` returns: the log density, a stochastic lower bound of it, or minus a loss without a density."""
+    trained_as_loss: bool = False
+    """Whether `log_prob` is minus a loss in training mode; `density` describes evaluation mode."""
     error_weight: bool = False
     """Whether the scale only weights a squared error and does not describe the spread of the data.
 
@@ -106,6 +108,11 @@ class ConditionalDistribution(nn.Module):
                 f"`residual` must be from 0 to 1 (share of the previous value that is added), got {residual}"
             )
         self.residual = float(residual)
+
+    @property
+    def present_density(self) -> str:
+        """What `log_prob` returns in the present mode, training or evaluation, as in `density`."""
+        return "loss" if self.training and self.trained_as_loss else self.density
 
     @property
     def label(self) -> str:

@@ -345,8 +345,11 @@ class DenoisingModule(ConditionalDistribution):
 class DiffusionModule(DenoisingModule):
     """Distribution module of `Diffusion`."""
 
+    density = "bound"
+
     def __init__(self, spec: Diffusion, shape: Shape):
         super().__init__(spec, shape)
+        self.trained_as_loss = spec.loss == "velocity"
         low, high = spec.log_snr
         ends = torch.tensor([-high, -low])
         if spec.schedule == "learned":
@@ -393,14 +396,9 @@ class DiffusionModule(DenoisingModule):
         low, high = ((end + self.spec.shift) / 2 for end in self.noise_range)
         return low.exp().atan(), high.exp().atan()
 
-    @property
-    def density(self) -> str:  # type: ignore[override]
-        """ "loss" while the loss "velocity" is trained, else "bound"."""
-        return "loss" if self.training and self.spec.loss == "velocity" else "bound"
-
     @override
     def score(self, parameters: Parameters, value: Tensor) -> Tensor:
-        if self.density == "loss":
+        if self.present_density == "loss":
             loc, scale, *others = parameters
             _, v, guess, _ = self._estimate((loc.detach(), scale.detach(), *others), value)
             normal = Normal(loc, scale, validate_args=False)  # without reading values of a GPU
@@ -477,8 +475,8 @@ class DenoisingDistribution(TorchDistribution):
 
     @property
     def density(self) -> str:
-        """What `log_prob` returns, as in `ConditionalDistribution.density`."""
-        return self.module.density
+        """What `log_prob` returns, as in `ConditionalDistribution.present_density`."""
+        return self.module.present_density
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return what `density` declares, of the batch shape, for values (..., D); random."""

@@ -73,7 +73,7 @@ class ProductModule(ConditionalDistribution):
         self.parts = nn.ModuleList(parts)
         self.places = [list(places) for places, _ in spec.parts]
         for index, part in enumerate(parts):
-            if part.deterministic or part.density == "loss":
+            if part.deterministic or part.density == "loss" or part.trained_as_loss:
                 raise ValueError(
                     f"the distribution {spec.parts[index][1]} of the coordinates {self.places[index]} of {shape.name} "
                     "has no density, which a Product requires; use a distribution with a density, such as Normal()"

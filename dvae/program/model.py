@@ -221,9 +221,11 @@ class DynamicalVAE(nn.Module):
         for name in self.latents:
             # minus a lower bound of the guide's density is an upper bound, so the ELBO would not be a bound
             for conditional, allowed in ((self.generator[name], ("exact", "bound")), (self.encoder[name], ("exact",))):
-                if conditional.head.density not in allowed:
+                head = conditional.head
+                density = "loss" if head.trained_as_loss else head.density
+                if density not in allowed:
                     raise ValueError(
-                        f"{conditional.factor} has a {conditional.head.density} in place of a density, but the "
+                        f"{conditional.factor} has a {density} in place of a density, but the "
                         f"distribution of a latent needs a density{' or a bound' * ('bound' in allowed)}; use another "
                         "one, such as distributions.Normal()"
                     )
@@ -747,10 +749,7 @@ class DynamicalVAE(nn.Module):
             ValueError: if a latent is missing or has the wrong shape, or a variable has a loss instead of a density.
         """
         if losses := [name for name in self.observed if self.generator[name].head.density == "loss"]:
-            advice = "; a Diffusion has a bound in evaluation mode (model.eval())" if self.training else ""
-            raise ValueError(
-                f"{', '.join(losses)} has a loss instead of a density, so the model has no log joint{advice}"
-            )
+            raise ValueError(f"{', '.join(losses)} has a loss instead of a density, so the model has no log joint")
         if missing := [name for name in self.latents if name not in latents]:
             raise ValueError(f"the log joint needs a value of every latent; missing are {', '.join(missing)}")
         for name, value in latents.items():

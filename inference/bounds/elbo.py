@@ -210,7 +210,7 @@ class SequenceELBO(ELBO):
 
 
 def _density(run: Rollout | None, name: str) -> str:
-    return "exact" if run is None else run.conditionals[name].head.density
+    return "exact" if run is None else run.conditionals[name].head.present_density
 
 
 def _traces(model: Any, guide: Any, args: Any, kwargs: Any) -> tuple[poutine.Trace, poutine.Trace]:
@@ -336,15 +336,15 @@ def _mean(draws: list[Terms]) -> Terms:
 
 
 def require_likelihood(model: DynamicalVAE) -> None:
-    """Refuse a model whose data are functions of its latents.
+    """Refuse a model whose data have no density given its latents.
 
     Raises:
         ValueError: when the model has no likelihood, and so no bound.
     """
     if not model.likelihood:
         raise ValueError(
-            f"{model.generative} has no likelihood: its data are functions of its latents, trained by energies. It "
-            "has no bound, and nothing to calibrate; evaluate its forecasts with dvae.evaluate"
+            f"{model.generative} has no likelihood: its data are functions of its latents, or have a loss in place of "
+            "a density. It has no bound, and nothing to calibrate; evaluate its forecasts with dvae.evaluate"
         )
 
 

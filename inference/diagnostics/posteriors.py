@@ -294,7 +294,7 @@ class _Search:
             if site["type"] == "sample" and not site["is_observed"] and not poutine.util.site_is_subsample(site)
         }
         runs = {name: site["infer"]["run"] for name, site in nodes.items() if "run" in (site.get("infer") or {})}
-        if rough := [name for name, run in runs.items() if run.conditionals[name].head.density != "exact"]:
+        if rough := [name for name, run in runs.items() if run.conditionals[name].head.present_density != "exact"]:
             raise ValueError(
                 f"{', '.join(rough)} has a random bound or loss in place of a density, so its program has no energy "
                 "with a mode; use the draws of a guide"

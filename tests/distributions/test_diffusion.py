@@ -129,7 +129,14 @@ def test_the_loss_of_v_trains_location_and_scale_by_the_normal_density():
     ):
         gradients.append(torch.autograd.grad(density(module(features)).log_prob(x).sum(), module.out.weight)[0])
     torch.testing.assert_close(*gradients)
-    assert (module.train().density, module.eval().density) == ("loss", "bound")
+    assert (module.train().present_density, module.eval().present_density) == ("loss", "bound")
+
+
+@pytest.mark.parametrize("name", ["z", "x"])
+def test_a_density_that_is_trained_as_a_loss_is_refused_where_a_density_is_needed(name):
+    spec = VELOCITY if name == "z" else Product((((0,), VELOCITY), ((1,), Normal())))
+    with pytest.raises(ValueError, match=r"loss in place of a density|has no density"):
+        dvae.DynamicalVAE("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 2, "x": 2}, distributions={f"p({name})": spec})
 
 
 @pytest.mark.parametrize("spec", [Diffusion(hidden=(32, 32)), VELOCITY, FlowMatching(hidden=(32, 32))])

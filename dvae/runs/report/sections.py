@@ -318,7 +318,7 @@ def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int 
     def cell(name: str) -> Markup:
         if comparison is None or name not in comparison.rows:
             return missing_part(
-                "The model has no likelihood: its data are functions of its latents, so there is no bound and no KL."
+                "The model has no likelihood: its data have no density, so there is no bound and no KL."
             )
         return _evidence(comparison, name)
 
