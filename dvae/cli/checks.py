@@ -288,7 +288,9 @@ def _test_steps(run: runs.Loaded) -> int:
 
 
 def _between_cutoffs(loaded_runs: Sequence[tuple[runs.Loaded, Any]], label: str | None) -> tuple[list[Any], list[Any]]:
-    """Return models and the windows between their cutoff and the next one whose futures end by the last cutoff.
+    """Return models, and for each the windows between its cutoff and the next one.
+
+    Windows with futures that end after the last cutoff are left out, since the test contains these steps.
 
     Raises:
         UsageError: the runs are not of one method and seed at several cutoffs of a table, or there is no such window.

@@ -226,7 +226,7 @@ class DenoisingModule(ConditionalDistribution):
         raise NotImplementedError
 
     def sampler_angles(self, t: Tensor) -> Tensor:
-        """Return the angles (...) at which the sampler evaluates the denoiser, for t (...) from 1, noise, to 0."""
+        """Return the angle a (...) of the sampler at t (...), the share of its steps that remain, from 1 to 0."""
         return self.angle(t)
 
     def score(self, parameters: Parameters, value: Tensor) -> Tensor:

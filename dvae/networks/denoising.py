@@ -103,7 +103,7 @@ class SequenceDenoiser(nn.Module):
         return reshaped
 
     def _given(self, features: Tensor, entries: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return what the network reads besides the noisy values, numbers of valid steps, and the basis if any."""
+        """Return the other inputs of the network (B, T or n, H + D), lengths (B,), and the basis (B, T, T) if any."""
         is_valid = entries[..., :1] >= 0
         others = torch.cat([features, (entries > 0).to(features.dtype)], -1)
         others, lengths = torch.where(is_valid, others, 0.0).flatten(0, -3), is_valid.sum((-2, -1)).flatten()

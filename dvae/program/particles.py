@@ -111,7 +111,7 @@ class Particles:
     # The steps ----------------------------------------------------------------------------------------------------
 
     def start(self) -> Tensor:
-        """Draw the static latents that precede the steps, evaluate what is known about all steps, and `normalise`."""
+        """Draw the static latents that precede the steps, prepare the networks of all steps, and `normalise`."""
         model = self.model
         self.log_weights = self._draw_statics(late=False).view(self.particles, -1) - math.log(self.particles)
         with memoizing():

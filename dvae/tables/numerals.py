@@ -205,7 +205,7 @@ def is_multiple(values: np.ndarray, unit: float) -> np.ndarray:
 
 
 def resolution(values: np.ndarray) -> float:
-    """Return the largest unit, 1 or 5 times a power of 10, of which all values are multiples; 0 without one."""
+    """Return the largest unit that divides all values, 0 if there is none; units are 1 or 5 times a power of 10."""
     for unit in (float(f"{digit}e{exponent}") for exponent in range(6, -5, -1) for digit in (5, 1)):
         if is_multiple(values, unit).all():
             return unit
