@@ -17,8 +17,8 @@ al., 2022), so a forecast has one level and one scale. A value without a base is
 deviation of f(x) in the training data.
 
 The map is triangular with diagonal f'(x_t) / s_t, so densities and bounds of a model with this view are densities of
-the data. With L = 1, the mean of a forecast is the last value plus what the model adds; with a season, it is the mean
-of earlier seasons plus what the model adds.
+the data. A model whose y_t is 0 forecasts the level of the sequence with L = 0, a linear trend from the last value with
+L = 1, because m_t is a mean change, and earlier seasons with L > 1. What the model predicts is added to this forecast.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class PredictionBands(Result):
         seed: seed of their draws.
         options: further arguments of the model's `forecast`.
         clusters: C, number of exchangeable clusters among the calibration windows.
-        data: description of these windows.
+        data: description of these windows; "until" is the time of their last step if the bands adapt.
         rate: γ of bands that adapt over time; 0 for fixed ones.
 
     Example:
@@ -132,8 +132,14 @@ class PredictionBands(Result):
             windows: windows to evaluate.
 
         Raises:
-            ValueError: if bands adapt, but the windows are not from a table and have no times.
+            ValueError: if bands adapt, and the windows have no times, or start before the calibration futures end.
         """
+        until = self.data.get("until")
+        if early := 0 if until is None else int((_origins_of(windows)[:, 0] < until).sum()):
+            raise ValueError(
+                f"{early} of {len(windows)} windows start before the last future of the calibration ends, so these "
+                "prediction bands have seen their values; leave these windows out, or calibrate on earlier ones"
+            )
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
         percent, least = f"{100 * self.level:g} %", {"raw": max(3, _min_count(self.level)), "calibrated": 1}
@@ -417,7 +423,11 @@ def conformal_bands(
         seed=seed,
         options=dict(options or {}),
         clusters=clusters,
-        data={**sources[-1].description(), "windows": len(keys), "fingerprint": fingerprint},
+        data={
+            **sources[-1].description(),
+            **{"windows": len(keys), "fingerprint": fingerprint},
+            **({} if origins is None else {"until": float(origins[:, 1].max())}),
+        },
         rate=0.0 if origins is None else rate,
     )
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 LAGS = 8
-"""Largest order of an autoregression, which BIC selects; one season, one more step, and two seasons are added."""
+"""Largest order of an autoregression."""
 RIDGE = 0.1
 """Ridge of standardised regressors."""
 LEAST = 10
@@ -34,7 +34,9 @@ def fill_missing(errors: Tensor, seed: int = 0) -> Tensor:
 def autoregression(
     z: Tensor, slope: Tensor, observed: int, season: int | None = None
 ) -> tuple[tuple[int, ...], Tensor]:
-    """Fit linear autoregressions of D columns to the future steps of training windows, with the order of smallest BIC.
+    """Fit linear autoregressions of D columns to the future steps of training windows, with the lags of smallest BIC.
+
+    BIC selects the order, and whether to add one season, one more step, and two seasons.
 
     Args:
         z: windows `(N, O + H, D)`, standardised, NaN where missing.
@@ -47,10 +49,10 @@ def autoregression(
     """
     y, steps = z[:, observed:], range(observed, z.shape[1])
     seen = ~y.isnan()
-    seasonal = [lag for lag in (season, season + 1, 2 * season) if lag <= observed] if season else []
+    seasonal = {lag for lag in (season, season + 1, 2 * season) if lag <= observed} if season else set()
+    orders = [set(range(1, order + 1)) for order in range(1, min(LAGS, observed) + 1)]
     number, fits = seen.sum((0, 1)).clamp(min=1), []
-    for order in range(1, min(LAGS, observed) + 1):
-        lags = tuple(sorted({*range(1, order + 1), *seasonal}))
+    for lags in dict.fromkeys(tuple(sorted(order | more)) for more in (set(), seasonal) for order in orders):
         x = _design(z, slope, lags, steps)
         gram = torch.einsum("nhpd,nhqd,nhd->dpq", x, x, seen.to(x)) + RIDGE * torch.eye(len(lags) + 2)
         coefficients = torch.linalg.solve(gram, torch.einsum("nhpd,nhd->dp", x, y.nan_to_num())).T
