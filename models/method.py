@@ -308,7 +308,7 @@ def with_residual(distribution: Any, residual: float) -> Any:
         family = next((name for name, spec in FAMILIES.items() if spec == distribution), kind)
         raise ValueError(
             f"residual is {residual}, but the family {family!r} has no location to which the previous value can be "
-            "added; leave residual at 0, take the family real for these columns, or take the units changes"
+            "added; leave residual at 0, take the family real for these columns, or for positive ones the units changes"
         )
     return replace(distribution, residual=residual)
 

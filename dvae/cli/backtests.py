@@ -45,7 +45,7 @@ def backtest(
         training: options of the runs; `dvae show METHOD` prints the defaults of each method.
         source: table to fit to; it is divided by time, without regard to --split and --test.
         cutoffs: number of cutoffs.
-        step: steps from one cutoff to the next, and from the last one to the end; the horizon by default.
+        step: steps from one cutoff to the next, and from the last one to the end; at least the horizon, the default.
         refit: fit again at every cutoff; otherwise the fits at the first cutoff make all forecasts.
         seeds: seeds of initial weights, batches and draws, one run for each.
         latent: size of z.

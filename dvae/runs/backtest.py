@@ -24,7 +24,7 @@ from ..inference.evaluation.record import MODELS, Dims
 from ..inference.evaluation.result import PlainConsole, Table
 from ..inference.training.options import Training
 from ..models.method import Method
-from ..options import Count, require
+from ..options import Count, nearest, require
 from .directory import load
 from .sweep import require_ended, sweep
 
@@ -83,7 +83,13 @@ class Backtest(Evaluation):
 
         Args:
             metric: name of the score.
+
+        Raises:
+            ValueError: no method has this score.
         """
+        if metric not in self.metrics:
+            names = ", ".join(self.metrics)
+            raise ValueError(f"no score {metric!r}{nearest(metric, self.metrics)}; the scores are {names}")
         table = Table(title=f"{metric} by first step of the forecasts")
         for name in ("", *self.rows):
             table.add_column(name, justify="right" if name else "left")
@@ -132,7 +138,7 @@ def backtest(
         seeds: seeds of the fits of each method. Several give one row for each, such as srnn-seed0.
         training: all training options, or those that replace each method's defaults.
         jobs: number of fits in parallel.
-        step: number of steps between cutoffs; the horizon by default.
+        step: number of steps between cutoffs, at least the horizon, which is the default.
         refit: whether to fit at every cutoff, or only at the first one. References always use all steps before a
             cutoff.
         progress: whether to show progress.
@@ -157,6 +163,11 @@ def backtest(
     """
     step = data.protocol.horizon or 1 if step is None else step
     require(Count, cutoffs=cutoffs, step=step)
+    if step < (data.protocol.horizon or 1):
+        raise ValueError(
+            f"step is {step} and the horizon {data.protocol.horizon}; step must be at least the horizon, since the "
+            "last cutoff is this number of steps before the end"
+        )
     if not isinstance(training, Training):
         training = {"progress": progress, **(training or {})}
     console = PlainConsole(stderr=True, quiet=not progress)

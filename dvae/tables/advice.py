@@ -19,7 +19,7 @@ SPIKE, REPEATS = 0.05, 20
 HURDLE = 0.3
 """Share of equal values above which a family or a column of its own for them is proposed too."""
 ALIGNED = 0.5
-"""Share of the pairs of a sequence and a date that have a row, above which sequences have the same dates."""
+"""Share of the pairs of a sequence and a date that have a row, above which sequences share their dates."""
 YEARS = (1500, 2500)
 """Range of whole numbers that are read as years."""
 SAME, SAME_CHANGE = 0.999, 0.95
@@ -33,6 +33,8 @@ CONTRAST = 10.0
 """Ratio of scales or levels of sequences above which they differ."""
 LONG = 8
 """Minimum number of values that determine the scale of a sequence."""
+NEAR = 7
+"""Largest lag of copies in which no number is unique."""
 ROWS, COMPARED, COLUMNS = 200_000, 5000, 30
 """Maximum numbers of rows that are read, and of rows and columns that are compared with each other."""
 
@@ -50,7 +52,9 @@ def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
     values = np.concatenate([np.asarray(sequence.values[:ROWS], np.float64) for sequence in sequences])
     owners = np.repeat(np.arange(len(sequences)), [len(sequence.values[:ROWS]) for sequence in sequences])
     times = [sequence.times[:ROWS] for sequence in sequences if sequence.times is not None]
-    dated = _dated(columns, values, np.concatenate(times), panel.calendar, owners, guessed) if times else ()
+    dated = _untimed(columns, values, owners)
+    if times:
+        dated = _dated(columns, values, np.concatenate(times), panel.calendar, owners, guessed)
     compared = columns[:COLUMNS], values[:COMPARED, :COLUMNS], owners[:COMPARED]
     return [
         *_spikes(columns, values),
@@ -98,7 +102,7 @@ def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
 
 
 def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:
-    reason = "a split by sequence would reveal events of the test dates, since all sequences have the same dates"
+    reason = "a split by sequence would reveal events of the test dates, since the sequences share their dates"
     if is_aligned(panel) and not any(sequence.split for sequence in panel):
         if cut.split == "sequence":
             yield f'{reason}; set split = "time" in [cut], with observed and horizon (--split time)'
@@ -146,6 +150,17 @@ def _dated(
             yield f"{name!r} {what}, and is guessed as known; if its future is unknown, make it past (--past {name})"
 
 
+def _untimed(columns: Sequence[Column], values: np.ndarray, owners: np.ndarray) -> Iterator[str]:
+    """Yield targets that increase at every step of every sequence."""
+    changes = np.diff(values, axis=0)[np.diff(owners) == 0]
+    for column, rises in zip(columns, (changes > 0).all(0), strict=True):
+        if rises and column.role == "target" and len(changes) >= REPEATS:
+            yield (
+                f"{column.name!r} increases at every step, and no column is the time; if it is the time, declare it "
+                f"(--time {column.name})"
+            )
+
+
 def _leaks(columns: Sequence[Column], values: np.ndarray, owners: np.ndarray) -> Iterator[str]:
     """Yield columns that follow from a target."""
     import pandas as pd
@@ -155,19 +170,25 @@ def _leaks(columns: Sequence[Column], values: np.ndarray, owners: np.ndarray) ->
     ranked, size = joined.corr(method="spearman", min_periods=REPEATS).to_numpy(), len(columns)
     for a, target in enumerate(columns):
         for b, other in enumerate(columns):
-            if a == b or target.role != "target" or other.role not in ("target", "known"):
+            if a == b or target.role != "target" or other.role == "static":
                 continue
-            is_first, text = b > a or other.role == "known", ""
-            if is_first and abs(ranked[a, b]) > SAME and abs(ranked[size + a, size + b]) > SAME_CHANGE:
+            is_first, text, remedy = b > a or other.role != "target", "", f", or make it past (--past {other.name})"
+            lag = _lag(values[:, a], values[:, b], owners) if is_first else 0
+            if lag < 0:
+                text, remedy = f"equals {target.name!r} {-lag} steps later", ""
+            elif other.role == "past":
+                continue
+            elif is_first and abs(ranked[a, b]) > SAME and abs(ranked[size + a, size + b]) > SAME_CHANGE:
                 text = f"is a function of {target.name!r} at the same step"
             elif _is_step(values[:, b], values[:, a]):
                 text = f"is a step function of {target.name!r} at the same step"
             elif ranked[a, size + b] > SAME:
                 text = f"is a running total of {target.name!r}"
-            elif is_first and (lag := _lag(values[:, a], values[:, b], owners)):
-                text = f"equals {target.name!r} {abs(lag)} steps {'before' if lag > 0 else 'later'}"
+            elif lag:
+                text = f"equals {target.name!r} {lag} steps before"
             if text:
-                yield f"{other.name!r} {text}; leave one of them out (--columns), or make it past (--past {other.name})"
+                which = "one of them" if remedy or other.role == "target" else "it"
+                yield f"{other.name!r} {text}; leave {which} out (--columns){remedy}"
 
 
 def _is_step(values: np.ndarray, source: np.ndarray) -> bool:
@@ -183,13 +204,24 @@ def _is_step(values: np.ndarray, source: np.ndarray) -> bool:
 
 
 def _lag(source: np.ndarray, values: np.ndarray, owners: np.ndarray) -> int:
-    """Return by how many steps values repeat a source, found by numbers that occur once in it; 0 if they do not."""
+    """Return by how many steps values repeat a source; 0 if they do not.
+
+    Numbers that occur once in the source show any lag, and numbers that differ from their predecessor a small one.
+    """
     levels, first, counts = np.unique(source, return_index=True, return_counts=True)
     place = np.searchsorted(levels, values).clip(max=len(levels) - 1)
     rows = np.flatnonzero((levels[place] == values) & (counts[place] == 1) & (owners == owners[first[place]]))
     lags, counts = np.unique(rows - first[place[rows]], return_counts=True)
     is_copy = len(rows) >= REPEATS and counts.max() > (1 - SPIKE) * len(rows)
-    return int(lags[counts.argmax()]) if is_copy else 0
+    if is_copy:
+        return int(lags[counts.argmax()])
+    rows = 1 + np.flatnonzero((np.diff(source) != 0) & ~np.isnan(np.diff(source)) & (np.diff(owners) == 0))
+    for lag in sorted(set(range(-NEAR, NEAR + 1)) - {0}, key=abs):
+        inside = rows[(rows + lag >= 0) & (rows + lag < len(values))]
+        known = inside[(owners[inside + lag] == owners[inside]) & ~np.isnan(values[inside + lag])]
+        if len(known) >= REPEATS and (values[known + lag] == source[known]).mean() > 1 - SPIKE:
+            return lag
+    return 0
 
 
 def _scales(columns: Sequence[Column], sequences: Sequence[Series]) -> Iterator[str]:

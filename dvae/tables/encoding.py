@@ -264,7 +264,8 @@ class PanelSchema(Schema):
         """
         require(TargetUnits, target_units=target_units)
         schema = replace(self, target_units=target_units)
-        if target_units != "columns" and not any(schema._prior(column) for column in self.columns.targets):
+        is_known = target_units != "seasonal" or self.cut.season is not None
+        if target_units != "columns" and not (is_known and any(map(schema._prior, self.columns.targets))):
             names = ", ".join(f"{column.name} ({column.family})" for column in self.columns.targets)
             needs = {"logs": "a column of a positive family", "seasonal": "a season (season=7, --season 7)"}
             need = needs.get(target_units, "a column of numbers or counts")

@@ -199,7 +199,7 @@ def _is_float(text: str) -> bool:
 
 def is_multiple(values: np.ndarray, unit: float) -> np.ndarray:
     """Return whether values are multiples of a unit, up to rounding errors of float32."""
-    multiples = values / unit
+    multiples = np.asarray(values, np.float64) / unit
     difference: np.ndarray = np.abs(multiples - np.rint(multiples))
     return difference <= (1e-6 * np.abs(multiples)).clip(max=0.1)
 

@@ -163,8 +163,10 @@ class Panel:
                 with np.errstate(invalid="ignore", over="ignore"):
                     precise = cells.astype(np.float32)  # as models
                     valid = is_valid(precise)
-                    if self.columns.columns[indices[0]].family == "hurdle":  # tiny values must not become zeros
+                    if (first := self.columns.columns[indices[0]]).family == "hurdle":  # tiny values are not zeros
                         valid &= (cells == 0) == (precise == 0)
+                    if first.rounding:
+                        valid &= is_multiple(cells, float(first.rounding))
                 invalid = ~(valid & (np.abs(cells) < LARGEST)) & ~absent[:, indices]
                 if invalid.any():
                     row, offset = np.argwhere(invalid)[0]
@@ -384,10 +386,7 @@ def _validity_test(column: Column) -> tuple[Callable[[np.ndarray], np.ndarray], 
         "angle": (lambda v: np.abs(v) <= np.pi + 1e-6, "radians from -pi to pi"),
     }
     is_valid, domain = tests.get(column.family, (lambda v: ~np.isnan(v), "numbers"))
-    if column.rounding:
-        unit = float(column.rounding)
-        return (lambda v: is_valid(v) & is_multiple(v, unit)), f"{domain} that are multiples of its rounding, {unit:g}"
-    return is_valid, domain
+    return is_valid, domain + (f" that are multiples of its rounding, {column.rounding:g}" if column.rounding else "")
 
 
 def _counts(values: np.ndarray) -> np.ndarray:

@@ -73,7 +73,8 @@ class PredictionBands(Result):
         seed: seed of their draws.
         options: further arguments of the model's `forecast`.
         clusters: C, number of exchangeable clusters among the calibration windows.
-        data: description of these windows; "until" is the time of their last step if the bands adapt.
+        data: description of these windows; "until" has the time of the last step of each sequence if the
+            bands adapt.
         rate: γ of bands that adapt over time; 0 for fixed ones.
 
     Example:
@@ -132,13 +133,16 @@ class PredictionBands(Result):
             windows: windows to evaluate.
 
         Raises:
-            ValueError: if bands adapt, and the windows have no times, or start before the calibration futures end.
+            ValueError: if bands adapt, and the windows have no times, or a calibration future of the same sequence
+                ends after the origin of a window.
         """
-        until = self.data.get("until")
-        if early := 0 if until is None else int((_origins_of(windows)[:, 0] < until).sum()):
+        until = self.data.get("until", {})
+        now = _origins_of(windows)[:, 0].tolist() if until else []
+        early = sum(time < until.get(key[1], time) for key, time in zip(windows.keys, now, strict=bool(until)))
+        if early:
             raise ValueError(
-                f"{early} of {len(windows)} windows start before the last future of the calibration ends, so these "
-                "prediction bands have seen their values; leave these windows out, or calibrate on earlier ones"
+                f"{early} of {len(now)} windows start before the calibration futures of their sequence end, so "
+                "these prediction bands have seen their values; leave these windows out, or calibrate on earlier ones"
             )
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
@@ -426,7 +430,7 @@ def conformal_bands(
         data={
             **sources[-1].description(),
             **{"windows": len(keys), "fingerprint": fingerprint},
-            **({} if origins is None else {"until": float(origins[:, 1].max())}),
+            **({} if origins is None else {"until": _last_steps(sources)}),
         },
         rate=0.0 if origins is None else rate,
     )
@@ -447,6 +451,15 @@ def _origins_of(windows: HeldOutWindows) -> Tensor:
             f"{type(windows).__name__}, which have no `origins`"
         )
     return origins
+
+
+def _last_steps(sources: Sequence[EvaluationWindows]) -> dict[str, float]:
+    """Return the time of the last step of each sequence."""
+    last: dict[str, float] = {}
+    for source in sources:
+        for (_, sequence, _), end in zip(source.keys, _origins_of(source.windows)[:, 1].tolist(), strict=True):
+            last[sequence] = max(end, last.get(sequence, end))
+    return last
 
 
 def equally_weighted_clusters(values: Tensor, clusters: Tensor) -> list[float]:

@@ -111,6 +111,14 @@ def test_a_single_fit_makes_all_forecasts(result, data, tmp_path):
     assert "fitted at the first cutoff" in str(single)
 
 
+def test_a_step_below_the_horizon_and_an_unknown_score_are_refused(result, data, tmp_path):
+    with pytest.raises(ValueError, match="step is 2 and the horizon 3; step must be at least the horizon"):
+        run(data, 3, tmp_path, step=2)
+    assert not [*tmp_path.iterdir()]
+    with pytest.raises(ValueError, match=r"no score 'CRSP' \(did you mean 'CRPS'\?\); the scores are"):
+        result.cutoff_table("CRSP")
+
+
 def test_it_is_read_back_from_json(result):
     again = Backtest.from_json(result.to_json())
     assert (str(again), again.to_json()) == (str(result), result.to_json())

@@ -10,6 +10,7 @@ from dvae.tables.advice import findings, is_aligned
 from dvae.tables.calendar import Calendar
 from dvae.tables.column_inference import infer_columns
 from dvae.tables.dataset import default_cut
+from dvae.tables.numerals import resolution
 
 pd = pytest.importorskip("pandas")
 
@@ -96,6 +97,25 @@ def test_automatic_rounding_is_the_unit_of_the_values():
         columns.but("x", family="count")
 
 
+def test_a_proposed_rounding_is_accepted_for_large_values():
+    cents = (2_000_000 + np.arange(300) // 2) / 100  # float32 resolves 0.002 here
+    series = [Series("shop", cents[:, None])]
+    assert resolution(cents) == 0.01
+    for rounding in (0.01, "auto"):
+        assert Panel(series, Columns((Column("sales", rounding=rounding),))).columns.columns[0].rounding == 0.01
+
+
+def test_a_target_that_may_be_the_time_is_named():
+    days, values = 1 + np.abs(noise(4, 30, 1)).cumsum(1), noise(4, 30, 1)
+    columns = Columns((Column("y"), Column("day")))
+    series = [Series(str(n), x) for n, x in enumerate(np.concatenate([values, days], 2))]
+    (text,) = findings(Panel(series, columns), Cut(3, 1, split="time"), True)
+    assert text == (
+        "'day' increases at every step, and no column is the time; if it is the time, declare it (--time day)"
+    )
+    assert not found(np.concatenate([values, days], 2))  # its sequences have times
+
+
 def test_absent_rows_are_named():
     days = np.arange(100)
     (text,) = found(noise(3, 98, 1), times=DAY * np.delete(days, [20, 50]))
@@ -119,11 +139,20 @@ def test_columns_that_reveal_a_target_are_named():
         texts = found(np.concatenate([x, column[..., None]], 2))
         assert [each for each in texts if f"'x2' {text}" in each], text
         assert all("--past x2" in each for each in texts if each.startswith("'x2'"))
-    lead = np.concatenate([x[:, 5:, 1], np.full((4, 5), np.nan)], 1)[..., None]
-    roles = Column("x0"), Column("x1"), Column("x2", "known")
-    assert "'x2' equals 'x1' 5 steps later" in found(np.concatenate([x, lead], 2), roles)[0]
-    past = (*roles[:2], Column("x2", "past"))
+    past = Column("x0"), Column("x1"), Column("x2", "past")
     assert not found(np.concatenate([x, x[..., 1:]], 2), past)
+
+
+@pytest.mark.parametrize("role", ["target", "known", "past"])
+@pytest.mark.parametrize("decimals", [9, 0])
+def test_columns_that_contain_the_future_of_a_target_are_left_out(role, decimals):
+    x = (50 + 3 * noise(4, 300, 1)).round(decimals)
+    columns = Column("x0", family="positive", rounding=10.0**-decimals), Column("lead", role)
+    for shift in (1, 5):
+        lead = np.concatenate([x[:, shift:], np.full((4, shift, 1), np.nan)], 1)
+        (text,) = (each for each in found(np.concatenate([x, lead], 2), columns) if each.startswith("'lead'"))
+        which = "one of them" if role == "target" else "it"
+        assert text == f"'lead' equals 'x0' {shift} steps later; leave {which} out (--columns)"
 
 
 def test_scales_and_levels_that_differ_are_named():

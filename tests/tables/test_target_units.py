@@ -80,6 +80,8 @@ def test_priors_come_from_training_sequences_and_survive_the_configuration(data)
     old = {name: value for name, value in schema.config().items() if name != "priors"}
     with pytest.raises(SchemaError, match="need a column of numbers or counts"):
         PanelSchema.from_config(old).in_units("series")
+    with pytest.raises(SchemaError, match=r"'seasonal' need a season \(season=7, --season 7\).*series or changes"):
+        PanelSchema.from_data(data.panel, replace(CUT, season=None)).in_units("seasonal")
     hurdle = Columns((Column("rain", family="hurdle"),))
     rain = Panel([Series(str(n), np.arange(20.0)[:, None] % 3) for n in range(6)], hurdle)
     for units in ("logs", "seasonal", "changes"):
