@@ -295,11 +295,14 @@ class DynamicalVAE(nn.Module):
         diffusion model (Rombach et al., 2022, arXiv 2112.10752). The frozen parameters have `requires_grad` False.
 
         Args:
-            distributions: dictionary from generative factor of a latent, such as "p(w)", to its new distribution. If
-                the factor has a network, it has the same description as before and new weights.
+            distributions: dictionary from generative factor of a latent to its new distribution. A short key, such as
+                "p(w)", keeps the parents. A whole factor, such as "p(z_{1:T})", replaces the old one, with parents
+                among the variables of the model. If the factor has a network, it has the same description as before
+                and new weights.
 
         Raises:
-            ValueError: if a key is not a factor of a latent, the guide is the prior, or a distribution does not fit.
+            ValueError: if a key is not a factor of a latent, the guide is the prior, or a factor or a distribution does
+                not fit.
 
         Example:
             >>> model = dvae.DynamicalVAE("p(w) p(x_t | w)", "q(w | x_{1:T})", {"w": 2, "x": 3})
@@ -309,18 +312,26 @@ class DynamicalVAE(nn.Module):
             >>> dvae.fit(second, x, steps=3, progress=False).status
             'finished'
         """
-        names = {f"p({name})": name for name in self.latents}
-        if not distributions or set(distributions) - set(names):
+        new = {factor.child: factor for key in distributions for factor in Factorization.parse(key).factors}
+        old = {name: self.generative.factor(name) for name in self.latents}
+        new |= {name: factor for name, factor in old.items() if f"p({name})" in distributions}
+        misfits = [name for name, factor in new.items() if name not in old or factor.local != old[name].local]
+        if len(new) != len(distributions) or not new or misfits:
+            names = ", ".join(map(str, old.values()))
             raise ValueError(
                 f"got distributions of {', '.join(distributions) or 'nothing'}; expected factors of latents, which are "
-                f"{', '.join(names) or 'missing in this model'}"
+                f"{names or 'missing in this model'}"
             )
         if "encoder" not in self._modules:
             raise ValueError("the guide is the prior, so a new prior would replace both; give the model a guide")
         model = copy.deepcopy(self).requires_grad_(False)
         model._name = f"dvae{next(_COUNT)}"
-        model.distributions = {**self.distributions, **distributions}
-        added = model._conditionals([model.generative.factor(names[key]) for key in distributions], model.encoder)
+        model.generative = Factorization("p", tuple(new.get(each.child, each) for each in self.generative.factors))
+        check_pair(model.generative, model.inference, model.observed, model.sizes, model.summed)
+        model._check_grouped()
+        by_factor = zip((f"p({name})" for name in new), distributions.values(), strict=True)
+        model.distributions = {**self.distributions, **dict(by_factor)}
+        added = model._conditionals(new.values(), model.encoder)
         for conditional in added.values():
             conditional.units.update(model.units.items())
         model.generator.update(added.to(like(self)))

@@ -88,10 +88,33 @@ def test_a_causal_prior_of_all_steps_reads_no_later_steps():
     assert torch.equal(model.generator["x"].head.out.weight, first.generator["x"].head.out.weight)
 
 
+def test_a_joint_prior_of_all_steps_replaces_independent_steps():
+    torch.manual_seed(0)
+    networks = {"p(x)": Dense(()), "q(z)": Recurrent(8)}
+    pair = "p(z_t) p(x_t | z_t)", "q(z_t | x_{1:T})"
+    first = dvae.DynamicalVAE(*pair, {"z": 1, "x": 1}, networks, {"p(x)": FixedNormal(0.5)})
+    options = {"learning_rate": 0.01, "decay": 0.5, "batch_size": 100, "progress": False}
+    dvae.fit(first, two_levels(500), steps=150, **options)
+    joint = Diffusion(denoiser=Denoiser(Attention(8, 2)), steps=4)
+    second = first.with_prior({"p(z_{1:T})": joint})
+    assert str(first.generative) == "p(x_{1:T}, z_{1:T}) = ∏_t p(z_t) p(x_t | z_t)"
+    assert second.generative.factor("z").parent("z").relation.reads(-5, 6)
+    dvae.fit(second, two_levels(1000), steps=300, **options)
+    x, elbo = two_levels(1000), dvae.SequenceELBO(num_particles=10)
+    gain = elbo.terms(second, x).bound - elbo.terms(first, x).bound
+    assert gain.mean() > 1 + 3 * gain.std() / math.sqrt(len(gain))
+    levels, old_levels = (each.sample(500, length=6)["x"].mean((1, 2)) for each in (second, first))
+    near, old_near = (((each.abs() - 2).abs() < 0.8).float().mean() for each in (levels, old_levels))
+    assert near > 0.7 > 0.4 > old_near
+
+
 @pytest.mark.parametrize(
     ("distributions", "message"),
     [
         ({}, "got distributions of nothing"),
+        ({"p(w)": Diffusion(), "p(w | u)": Diffusion()}, "expected factors of latents"),
+        ({"p(w | u)": Diffusion()}, "sizes missing for u"),
+        ({"p(w_t)": Diffusion()}, r"got distributions of p\(w_t\); expected factors of latents, which are p\(w\)"),
         ({"p(x)": Flow()}, r"factors of latents, which are p\(w\)"),
         ({"p(w)": FlowMatching()}, "has a loss in place of a density"),
     ],
