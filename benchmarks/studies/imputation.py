@@ -6,7 +6,7 @@ skips existing files. Options are chosen with `--part validation`, seed 0; `--pa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
@@ -27,8 +27,9 @@ from .tables import COVERAGE, cell, crps, load
 DRAWS = 100
 HIDDEN, HIDING_SEED = 0.2, 2026
 """Share of hidden entries, and the seed that hides them, the same for all runs."""
-LINEAR = "linear interpolation"
-"""Row of points on the line between the neighbours in time, of logarithms if a column is positive."""
+LINEAR = "interpolation"
+"""Row of linear interpolation in time, plus errors of hidden entries of training windows, of logarithms if a column is
+positive."""
 POSITIVE = ("positive", "log-normal")
 AT_ONCE = 64
 """Number of windows that are filled in at once."""
@@ -62,7 +63,7 @@ def transformed(x: Tensor, logarithm: Tensor) -> Tensor:
 
 
 def scores(draws: Tensor, truth: Tensor, hidden: Tensor, sequences: list[str]) -> dict[str, list[float]]:
-    """Return the CRPS and the coverage of hidden entries, by sequence; points have no coverage.
+    """Return the CRPS and the coverage of hidden entries, by sequence.
 
     Args:
         draws: draws `(S, N, T, D)`.
@@ -70,19 +71,41 @@ def scores(draws: Tensor, truth: Tensor, hidden: Tensor, sequences: list[str]) -
         hidden: whether an entry is hidden, `(N, T, D)`.
         sequences: name of each window's sequence.
     """
+    known = truth.masked_fill(~hidden, torch.nan)
     low, high = torch.quantile(draws, torch.tensor([0.05, 0.95], dtype=draws.dtype), 0)
+    inside = ((low <= truth) & (truth <= high)).double()
     by_window = {
-        "CRPS": continuous_ranked_probability_score(draws.movedim(0, 1), truth.masked_fill(~hidden, torch.nan))
+        "CRPS": continuous_ranked_probability_score(draws.movedim(0, 1), known),
+        COVERAGE: (inside * hidden).sum((1, 2)) / hidden.sum((1, 2)),
     }
-    if len(draws) > 1:
-        inside = ((low <= truth) & (truth <= high)).double()
-        by_window[COVERAGE] = (inside * hidden).sum((1, 2)) / hidden.sum((1, 2))
     numbers = hidden.sum((1, 2)).double()
     places = {name: [n for n, each in enumerate(sequences) if each == name] for name in dict.fromkeys(sequences)}
     return {
         score: [float((values.nan_to_num()[rows] @ numbers[rows]) / numbers[rows].sum()) for rows in places.values()]
         for score, values in by_window.items()
     }
+
+
+def interpolated(name: str, part: str) -> Tensor:
+    """Return draws (S, N, T, D) of interpolation in time, plus errors of the same column in training windows."""
+    truth, mask, hidden, _ = truth_of(name, "train")
+    errors, known = truth - interpolate_missing(truth, mask), hidden
+    truth, mask, *_ = truth_of(name, part)
+    generator, draws = (
+        torch.Generator().manual_seed(HIDING_SEED),
+        interpolate_missing(truth, mask).repeat(DRAWS, 1, 1, 1),
+    )
+    for column in range(truth.shape[-1]):
+        values = errors[..., column][known[..., column]]
+        draws[..., column] += values[torch.randint(len(values), draws.shape[:-1], generator=generator)]
+    return draws
+
+
+def truth_of(name: str, part: str) -> tuple[Tensor, Tensor, Tensor, list[str]]:
+    """Return values (N, T, D) in units of `units`, which are observed and which hidden, and sequences of windows."""
+    (batch, hidden, sequences), (logarithm, scale) = hidden_entries(name, part), units(name)
+    known = torch.where(hidden | batch["mask"], batch["x"], 1.0)
+    return transformed(known, logarithm) / scale, batch["mask"], hidden, sequences
 
 
 def run(name: str, part: str, case: str, seed: int, out: Path) -> dict[str, Any]:
@@ -93,32 +116,39 @@ def run(name: str, part: str, case: str, seed: int, out: Path) -> dict[str, Any]
     method = dvae.method(options.get("method", case), **options.get("options", {})).resolve_defaults(train)
     training = {**section["training"], **options.get("training", {})}
     fit = fit_or_load(method, data, train, data.windows("validation"), out=out, seed=seed, **training)
-    batch, hidden, sequences = hidden_entries(name, part)
+    batch, _, _ = hidden_entries(name, part)
     torch.manual_seed(seed)
     model = fit.model.eval()
     draws = torch.cat([model.impute(rows, DRAWS, draw=True)["x"] for rows in Sequences(batch).batches(AT_ONCE)], 1)
+    truth, _, hidden, sequences = truth_of(name, part)
     logarithm, scale = units(name)
-    truth = transformed(torch.where(hidden | batch["mask"], batch["x"], 1.0), logarithm) / scale
-    line = interpolate_missing(truth, batch["mask"])[None]
-    rows = {
-        OURS: scores(transformed(draws, logarithm) / scale, truth, hidden, sequences),
-        LINEAR: scores(line, truth, hidden, sequences),
-    }
+    by_row = {OURS: transformed(draws, logarithm) / scale, LINEAR: interpolated(name, part)}
+    rows = {row: scores(each, truth, hidden, sequences) for row, each in by_row.items()}
     weights = dict.fromkeys(sequences, 0.0)
     for sequence, number in zip(sequences, hidden.sum((1, 2)).tolist(), strict=True):
         weights[sequence] += number
     return {"seconds": fit.processor_seconds, **scores_of(weights, rows)}
 
 
-def table(cases: Mapping[str, Row], part: str) -> Table:
-    """Return a table of all rows, best first."""
-    runs = max((row.runs for row in cases.values()), key=len)
-    seconds = {case: np.mean([one["seconds"] for one in row.runs]) for case, row in cases.items()}
-    note = f"{part.capitalize()}: {sum(runs[0]['weights']):.0f} hidden entries of {len(runs[0]['clips'])} sequences; "
-    note += f"{len(runs)} seeds. Fits took " + ", ".join(f"{each:.0f} s ({case})" for case, each in seconds.items())
-    columns = {"CRPS": cell, COVERAGE: lambda row: cell(row, COVERAGE)}
-    rows = {**cases, LINEAR: Row(runs[:1], LINEAR, trained=False)}
-    return tabled(ordered(rows, crps), columns, note=f"{note} of processor time.")
+def table(measured: Mapping[str, Mapping[str, Row]], part: str) -> Table:
+    """Return a table of CRPS and coverage of each case on each table, in the order of the first one's CRPS."""
+    notes, columns, rows = [f"{part.capitalize()}."], dict[str, Callable[[str], str]](), dict[str, str]()
+    for name, cases in measured.items():
+        runs = max((row.runs for row in cases.values()), key=len)
+        available = {**cases, LINEAR: Row(runs[:1], LINEAR, trained=False)}
+        seconds = (f"{case} {np.mean([one['seconds'] for one in row.runs]):.0f}" for case, row in cases.items())
+        notes += [
+            f"{name}: {sum(runs[0]['weights']):.0f} hidden entries of {len(runs[0]['clips'])} sequences, {len(runs)} "
+            f"seeds; seconds of training: {', '.join(seconds)}."
+        ]
+        for score in ("CRPS", COVERAGE):
+            columns[f"{name}, {score}"] = partial(_cell, available, score)
+        rows |= {each: each for each in ordered(available, crps)}
+    return tabled(rows, columns, note=" ".join(notes))
+
+
+def _cell(available: Mapping[str, Row], score: str, name: str) -> str:
+    return cell(available[name], score) if name in available else "–"
 
 
 def main(
@@ -144,7 +174,8 @@ def main(
         chosen = [case for case in SECTIONS[name]["cases"] if not cases or case in cases]
         measure(runs / name, chosen, seeds, partial(run, name, part), f"{part}.json")
     measured = {name: read(runs / name, section["cases"], f"{part}.json") for name, section in SECTIONS.items()}
-    write(results, {f"tables/{name}-imputation": table(rows, part) for name, rows in measured.items() if rows})
+    if available := {name: rows for name, rows in measured.items() if rows}:
+        write(results, {"tables/imputation": table(available, part)})
 
 
 if __name__ == "__main__":
