@@ -94,8 +94,8 @@ class LikelihoodMethod(Method):
 
     Args:
         emission: distribution of x: "fixed" (normal, one learned scale per coordinate), "unit" (normal, variance 1),
-            "normal" (scale read from the parents) or "student" (Student t). By default the distributions of a table's
-            columns, or "fixed".
+            "normal" (scale read from the parents), "student" (Student t) or "diffusion" (with a bound in place of its
+            density). By default the distributions of a table's columns, or "fixed".
         residual: share of x_{t-1} that the mean of x_t keeps; the factor must read x_{t-1}. With 1 the network predicts
             an offset: one-step forecasts are sharp, but long forecasts can drift without limit. A smaller share limits
             the drift.
@@ -114,7 +114,7 @@ class LikelihoodMethod(Method):
     without_covariates: ClassVar[tuple[str, ...]] = ()
     """Factors that read no covariates, such as "p(z)"."""
 
-    emission: Literal["fixed", "unit", "normal", "student"] | None = None
+    emission: Literal["fixed", "unit", "normal", "student", "diffusion"] | None = None
     residual: Share = 0.0
     units: Literal["columns", "logs", "series", "changes", "seasonal"] | None = None
     scheduled_sampling: Share | None = 0.0
@@ -137,6 +137,7 @@ class LikelihoodMethod(Method):
             "fixed": FixedNormal(scale=0.1, learned=True, residual=self.residual),
             "unit": FixedNormal(residual=self.residual),
             "student": StudentT(residual=self.residual),
+            "diffusion": Diffusion(residual=self.residual),
         }
         return {"p(x)": emissions[self.emission or "fixed"]}
 

@@ -10,9 +10,11 @@ from typing import Annotated, Any
 from typing_extensions import override
 
 from ...data.schema import Schema, SchemaError
+from ...distributions import Diffusion, DistributionSpec
 from ...factorization.inversion import guide
 from ...factorization.notation import Factorization
-from ...networks import Attention, Dense, Linear, NetworkSpec, Recurrent
+from ...factorization.relations import ALL
+from ...networks import Attention, Denoiser, Dense, Linear, NetworkSpec, Recurrent, SelfAttention
 from ...options import Range, Size, nearest
 from ...program.enumeration import LARGEST, Discrete
 from ...program.model import DynamicalVAE
@@ -31,6 +33,8 @@ class Equations(LatentMethod):
         latents: sizes of the latents, where they differ from `latent`.
         states: numbers of states of discrete latents, which are summed out and have no factor in the guide.
         grouped: static latents that the sequences of a group share; see `dvae.program.groups`.
+        emission: as in `LikelihoodMethod`. With "diffusion", a factor written as p(x_{1:T}) or p(x_{1:T} | w) denoises
+            all steps at once: a transformer reads their cosine coefficients.
     """
 
     name = "equations"
@@ -79,6 +83,17 @@ class Equations(LatentMethod):
                 f"unknown network {self.network!r}{nearest(self.network, kinds)}; known: {', '.join(kinds)}"
             )
         return {"default": kinds[self.network]}
+
+    @override
+    def distributions(self) -> Mapping[str, DistributionSpec]:
+        """Return the distributions of x and of static latents."""
+        distributions = super().distributions()
+        if self.emission != "diffusion" or not re.search(r"p\(\s*x_\{1:T\}", self.generative):
+            return distributions
+        x = self.equations()[0].factor("x")
+        frequencies = all(parent.relation in (None, ALL) for parent in x.parents if parent.name != "x")
+        denoiser = Denoiser(SelfAttention(self.width, positions="sinusoids"), "cosine" if frequencies else None)
+        return {**distributions, "p(x)": Diffusion(denoiser=denoiser)}
 
     @override
     def model_arguments(self, sizes: Mapping[str, int]) -> dict[str, Any]:

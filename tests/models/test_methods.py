@@ -216,6 +216,7 @@ OPTIONS = [
     {"emission": "fixed"},
     {"emission": "normal"},
     {"emission": "student"},
+    {"emission": "diffusion"},
     {"residual": True},
     {"prior": "mixture", "prior_components": 2},
     {"prior": "vamp", "prior_components": 2, "prior_steps": 4},
