@@ -428,7 +428,7 @@ def test_the_state_does_not_grow(name, tmp_path):
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    "name", ["vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "dsae", "kvae", "autoregressive"]
+    "name", ["vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "dsae", "kvae", "rslds", "autoregressive"]
 )
 def test_every_method_of_the_family_filters_streams(name, tmp_path):
     x = torch.randn(3, 8, 4)
@@ -444,7 +444,9 @@ def test_every_method_of_the_family_filters_streams(name, tmp_path):
     online = name in ("vae", "storn", "vrnn", "kvae")
     if name not in ("vae", "storn", "vrnn"):  # where the guide proposes latents without any data
         assert (later.log_evidence[:, 2] == 0).all()
-    assert set(later.proposal.values()) == ({"guide"} if online else {"prior"} if model.latents else set())
+    assert {later.proposal[name] for name in model.latents} <= {"guide" if online else "prior"}
+    assert {later.proposal[name] for name in model.summed} <= {"exact"}
+    assert stream.predict().sample(2)["x"].isfinite().all()
     if online or not model.latents:
         torch.manual_seed(1)
         torch.testing.assert_close(whole.log_evidence.sum(1), fivo_bound(model, batch, 16).bound)
