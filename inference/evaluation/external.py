@@ -46,8 +46,10 @@ LARGEST, LARGEST_CSV = 2**32, 2**28
 NAMES = {"samples": ("samples", "forecasts", "draws"), "sequence": ("sequence", "clip")}
 """Names of members of an npz file; the further ones are those of `dvae forecast`."""
 READ = (*NAMES["samples"], *NAMES["sequence"], "split", "start", "step", "columns", "joint_names", "emission", "blend")
-UNREAD = ("observed", "past", "truth", "future", "horizon", "time", "times", "largest_steps")
-UNREAD += ("name", "parents", "joints_left", "joints_right", "up_axis", "fps")
+UNREAD = (
+    *("observed", "past", "truth", "future", "horizon", "time", "times", "largest_steps"),
+    *("name", "parents", "joints_left", "joints_right", "up_axis", "fps"),
+)
 """Members of an npz file that are read, and those that `dvae` writes and that are ignored here."""
 AXES = ("sequence", "start", "sample", "ahead")
 """Columns of a CSV file that place its rows."""

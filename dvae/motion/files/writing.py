@@ -182,8 +182,8 @@ def convert(
     from joblib import Parallel, delayed
 
     format = format_of(out, format)
-    if repeated := [source for n, source in enumerate(sources) if source in sources[:n]]:
-        raise ValueError(f"{repeated[0]} is given twice; give each file or folder once")
+    if twice := [source for n, source in enumerate(sources) if source in sources[:n]]:
+        raise ValueError(f"{twice[0]} is given twice; give each file or folder once")
     files_of_sources = [_files_of(source, len(sources) > 1) for source in sources]
     files = list(chain.from_iterable(files_of_sources))
     if units or prefix or not all(files_of_sources):
