@@ -22,6 +22,7 @@ from ..inference.training.checkpoints import CheckpointError, Run
 from ..locking import seeded
 from ..models.motion.codes import code_scores
 from ..models.motion.trajectories import TrajectoryModel
+from ..motion.data.protocols import RootMotion
 from ..motion.geometry.euler import euler_errors
 from ..motion.metric_models.pose_prior import PosePriorModel
 from ..motion.metric_models.quality import RealOrGenerated, quality
@@ -121,22 +122,24 @@ class External:
         axes: a letter for each axis of the samples in npz and npy files: k samples, n windows, t steps, d columns, or j
             joints and c coordinates; 1 for an axis of size 1. By default kntd or kntjc.
         unit: for motion: unit of the forecasts.
-        root: for motion with a moving root, under a protocol that removes it: subtract it from the other joints, or
-            ignore it if they are already relative to it.
+        root: without runs: the treatment of the root in the windows, as in `dvae fit`.
+        given_root: for forecasts with a moving root, under a protocol that removes it: subtract it from the other
+            joints, or ignore it if they are already relative to it.
     """
 
     forecasts: tuple[Path, ...] = ()
     protocol: ProtocolName | None = None
     axes: Expert[str] = ""
     unit: Expert[Unit] = "m"
-    root: Expert[Root | None] = None
+    root: Expert[RootMotion | None] = None
+    given_root: Expert[Root | None] = None
 
     def check(self) -> None:
         """Raise a `UsageError` if two files have the same name, or options for files have no file."""
         if len({path.stem for path in self.forecasts}) < len(self.forecasts):
             raise UsageError(f"--forecasts {' '.join(map(str, self.forecasts))}: give files with different names")
         if not self.forecasts and self != External():
-            raise UsageError("--protocol, --axes, --unit and --root need --forecasts; leave them out")
+            raise UsageError("--protocol, --root, --axes, --unit and --given-root need --forecasts; leave them out")
 
     def read(self, windows: Any, every: Any) -> dict[str, ForecastSamples]:
         """Return the forecasts by name; windows that are in `every` only are left out."""
@@ -144,10 +147,11 @@ class External:
         read = {name: each.within(every.keys, windows.keys) for name, each in read.items()}
         if isinstance(windows, motion.Windows):
             return {
-                name: motion.frames_of(each, windows, unit=self.unit, root=self.root) for name, each in read.items()
+                name: motion.frames_of(each, windows, unit=self.unit, root=self.given_root)
+                for name, each in read.items()
             }
-        if self.unit != "m" or self.root:
-            raise UsageError("--unit and --root are for motion; leave them out")
+        if self.unit != "m" or self.given_root:
+            raise UsageError("--unit and --given-root are for motion; leave them out")
         return read
 
 
@@ -218,8 +222,8 @@ def evaluate(
     is_of_segments = bool(run) and loading.kind_of(run, data) == "segments"
     if external.forecasts and (measure != "forecasts" or is_of_segments):
         raise UsageError("--forecasts is for scores of forecasts, not for another --measure or for segments")
-    if run and (external.protocol or source != AS_STORED):
-        raise UsageError("the runs define the windows; leave --protocol and options for reading the data out")
+    if run and (external.protocol or external.root or source != AS_STORED):
+        raise UsageError("the runs define the windows; leave --protocol, --root and options for reading the data out")
     options = samples, log_score_particles, pose_prior, classifier, control, missing, failed
     scoring = ForecastScoring(*options, several_futures, windows_of, ensembles)
     chosen = [name for name, options in (("angles", angles), ("quality", realism)) if options != type(options)()]
@@ -303,7 +307,7 @@ def _forecasts(
     elif data is None or scoring.classifier:
         raise UsageError("--forecasts needs --data, or runs; and --classifier needs runs")
     else:
-        data_set = source.open_at(data, protocol=external.protocol, missing=scoring.missing)
+        data_set = source.open_at(data, protocol=external.protocol, root=external.root, missing=scoring.missing)
         windows = data_set.windows("test")
     every = windows
     if data_set.kind == "motion":

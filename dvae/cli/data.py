@@ -73,7 +73,7 @@ def convert(
     """Convert motion files: all clips to one file (--out motion.npz), or one file per clip to a folder.
 
     Several files or folders are merged. They need the same joints and frames per second, which --onto and --fps give
-    them.
+    them. Splits keep their names; clips of a folder without splits get its name as their split.
 
     Args:
         files: motion files or folders (npz, bvh, amc, c3d, csv, exponential maps), or "simulated".
@@ -87,7 +87,7 @@ def convert(
         recorded: frames per second of the files, if they state a wrong rate.
         skip_bad: leave out and list clips that cannot be used, instead of refusing the file.
         units: units of some of the files, such as a.bvh=cm b.npz=m, in m, cm, mm, in, or metres per unit.
-        prefix: start the names of clips with the name of their archive; for recordings, folders, and archives with
+        prefix: start the names of clips with the name of their archive or folder; for recordings, and for sources with
             equal names, with the name of the folder that contains them.
     """
     target = _skeleton(onto)
@@ -145,7 +145,7 @@ def _units(texts: Sequence[str], files: Sequence[str]) -> dict[Path, float]:
             units[Path(file)] = lengths[unit] if unit in lengths else float(unit)
         except ValueError:
             raise UsageError(f"--units {text}: expected FILE={', FILE='.join(lengths)} or FILE=METRES") from None
-        if file not in files:
+        if Path(file) not in map(Path, files):
             raise UsageError(f"--units {text}: {file or 'no file'} is not among the files: {', '.join(files)}")
     if len(units) < len(texts):
         raise UsageError(f"--units {' '.join(texts)}: give each file one unit")

@@ -19,6 +19,7 @@ from functools import cached_property, reduce
 from typing import Annotated, Any, Self
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
@@ -205,9 +206,10 @@ class Prediction:
 
     def quantile(self, levels: float | Tensor, samples: int = 1000) -> dict[str, Tensor]:
         """Return quantiles (B, D), or (Q, B, D) for Q levels, of `samples` draws, in the unit of the data."""
-        return {
-            name: draws.quantile(torch.as_tensor(levels).to(draws), 0) for name, draws in self.sample(samples).items()
-        }
+        levels = torch.as_tensor(levels)
+        if levels.dim() > 1 or not ((levels >= 0) & (levels <= 1)).all():
+            raise ValueError(f"levels must be one number or a list of numbers from 0 to 1, got {levels.tolist()}")
+        return {name: draws.quantile(levels.to(draws), 0) for name, draws in self.sample(samples).items()}
 
 
 class Filter:
@@ -303,8 +305,7 @@ class Filter:
         if self.endless:
             raise ValueError(f"this filter cannot continue: {self.endless}; filter the whole sequences again")
         with self._running():
-            data = self._read(batch, [*self.model.observed, *self._context_names])
-            self.filtered = self._advance(self.model.rollout(data), data)
+            self.filtered = self._advance(*self._read(batch, [*self.model.observed, *self._context_names]))
         return self.filtered
 
     def predict(self, context: Mapping[str, Any] | None = None) -> Prediction:
@@ -315,34 +316,44 @@ class Filter:
         """
         if self.endless:
             raise ValueError(f"this filter cannot predict: {self.endless}")
-        names = self._context_names
-        if other := [name for name in context or {} if name not in names]:
+        names, context = self._context_names, {} if context is None else context
+        if not isinstance(context, Mapping):
+            raise TypeError(f"context is a {type(context).__name__}, expected a mapping from names to values (B, D)")
+        if other := [name for name in context if name not in names]:
             raise ValueError(f"a prediction reads {', '.join(names) or 'no context'}; leave out {', '.join(other)}")
         with self._running(), seeded(None, self.device):
             engine = self.engine.fork()
             engine.begin(self.resample_below)
             if names:
-                engine.feed(self.model.rollout(self._read(context or {}, names)), 0, names)
+                run, _ = self._read(context, names)
+                if run.length > 1:
+                    raise ValueError(f"a prediction reads context (B, D) of one step, got {run.length} steps")
+                engine.feed(run, 0, names)
             return Prediction(self.model, engine.predict())
 
     @property
     def _context_names(self) -> list[str]:
         return [n for n in self.model.context if self.model.reader.local[n]]
 
-    def _read(self, batch: AnyBatch, names: list[str]) -> Batch:
-        """Return new steps, which must contain these variables, together with the static variables."""
+    def _read(self, batch: AnyBatch, names: list[str]) -> tuple[Rollout, Batch]:
+        """Return a run and the data of new steps, which must contain these variables, with the static variables."""
         model = self.model
         refuse_table(batch)
         batch = batch if isinstance(batch, Mapping) else {WHOLE if model.view.parts else model.observed[0]: batch}
         if "lengths" in batch or "group" in batch:
             raise ValueError("an update continues all sequences by the same steps; leave out 'lengths' and 'group'")
+        if absent := [name for name, value in batch.items() if value is None]:
+            raise ValueError(f"{', '.join(absent)} is None; give the values of the new steps")
         if static := [name for name in batch if not model.reader.local.get(name, True)]:
             raise ValueError(f"static variables were given with the first steps; leave out {', '.join(static)}")
         tensors = Batch(batch).map(lambda value: torch.as_tensor(value).clone())  # the caller may reuse its tensors
         new = tensors.map(lambda value: value[:, None] if value.dim() == 2 else value)
         data: Batch = model.read({**self.engine.known.values, **new})
         _require_names(data, names)
-        return data
+        run = model.rollout(data)
+        if run.batch != self.engine.known.batch:
+            raise ValueError(f"the filter has {self.engine.known.batch} sequences, but the new steps have {run.batch}")
+        return run, data
 
     def _advance(self, run: Rollout, data: Batch, carried: Tensor | float = 0.0) -> Filtered:
         """Filter the steps of a run; `carried` is the log evidence (B,) of the static data before the first step."""
@@ -353,8 +364,6 @@ class Filter:
             if run.length > 1:
                 raise ValueError(f"{model.view} has one log-determinant for all steps, which the filter cannot divide")
             volume = volume[:, None]
-        if run.batch != engine.known.batch:
-            raise ValueError(f"the filter has {engine.known.batch} sequences, but the update has {run.batch}")
         names = [name for name in model.observed if model.generative.local(name)]
         if model.summed:
             model.sums.require_data(hidden_data(run))
@@ -418,7 +427,11 @@ class Filter:
     def load(cls, model: Any, path: str | os.PathLike[str]) -> Self:
         """Return the filter that `save` wrote, for the same model."""
         content = files.read(path, LARGEST, links=True)
-        settings, tensors = _settings(content, path), load_tensors(content)
+        settings = _settings(content, path)
+        try:
+            tensors = load_tensors(content)
+        except SafetensorError as error:
+            raise ValueError(f"{path} is damaged ({error}); write it again with `Filter.save`") from error
         if settings["weights"] != _checksum(model):
             raise ValueError(
                 f"{path} is the state of a filter for other weights; resume it with the model that wrote it"

@@ -176,7 +176,11 @@ def evaluate(
         notes=[
             *dict.fromkeys([*eval_windows.notes, *(measure.note for measure in measures if measure.note)]),
             *(available.notes if references is True else ()),
-            *_given_notes({name: count for name, (count, _) in external.items()}, samples if models else None),
+            *_given_notes(
+                {name: count for name, (count, _) in external.items()},
+                [name for name, each in given.items() if each.keys is None],
+                samples if models else None,
+            ),
             *(
                 f"{name} has samples outside the values of a column, which are scored as they are: {'; '.join(columns)}"
                 for name, each in given.items()
@@ -235,10 +239,12 @@ def _is_deterministic(model: Any, is_drawn: bool) -> bool:
     return isinstance(model, DynamicalVAE) and not (is_drawn or model.latents or model.summed or model.shared)
 
 
-def _given_notes(counts: Mapping[str, int], samples: int | None) -> Iterator[str]:
-    """Yield notes on forecasts of other software with these numbers of samples per window."""
+def _given_notes(counts: Mapping[str, int], in_order: Sequence[str], samples: int | None) -> Iterator[str]:
+    """Yield notes on forecasts of other software: numbers of samples per window, and names of rows without keys."""
     if counts:
         yield f"forecasts of {', '.join(counts)} were given, and not drawn from a model here"
+    if in_order:
+        yield f"forecasts of {', '.join(in_order)} have no keys: they are read in the order of the windows"
     if other := [f"{name} ({count})" for name, count in counts.items() if samples not in (None, count)]:
         yield f"best-of-K scores are not comparable with those of K = {samples}: {', '.join(other)}"
 

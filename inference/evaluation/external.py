@@ -4,7 +4,7 @@
 
 | file | content |
 |---|---|
-| npz | `samples` (K, N, T, D); keys `sequence`, `start` and optionally `split` (N,); optionally `columns` (D,) |
+| npz | `samples` (K, N, T, D); keys `sequence`, `start`, optionally `split` (N,), or as npy; maybe `columns` (D,) |
 | npy | samples (K, N, T, D), with the windows in the order of the evaluation |
 | CSV | columns `sequence`, `start`, optionally `split`; `sample`, `ahead` from 1 to T; and a column for each of D |
 
@@ -45,6 +45,12 @@ LARGEST, LARGEST_CSV = 2**32, 2**28
 """Maximum bytes of an unpacked npz file, and of a CSV file; an npy file is mapped and may be larger."""
 NAMES = {"samples": ("samples", "forecasts", "draws"), "sequence": ("sequence", "clip")}
 """Names of members of an npz file; the further ones are those of `dvae forecast`."""
+READ = (*NAMES["samples"], *NAMES["sequence"], "split", "start", "step", "columns", "joint_names", "emission", "blend")
+UNREAD = (
+    *("observed", "past", "truth", "future", "horizon", "time", "times", "largest_steps"),
+    *("name", "parents", "joints_left", "joints_right", "up_axis", "fps"),
+)
+"""Members of an npz file that are read, and those that `dvae` writes and that are ignored here."""
 AXES = ("sequence", "start", "sample", "ahead")
 """Columns of a CSV file that place its rows."""
 ORDERS = ("kntd", "kntjc")
@@ -109,10 +115,10 @@ class ForecastSamples:
         values, columns, sequences, starts = zip(*items, strict=True)
         kinds = [(tuple(window.shape), *names) for window, names in zip(values, columns, strict=True)]
         if len({*kinds}) > 1 or values[0].ndim != 3:
-            other = next((n for n, kind in enumerate(kinds) if kind != kinds[0]), 0)
+            other = [f", and item {n} has {kind!r:.300}" for n, kind in enumerate(kinds) if kind != kinds[0]]
             raise ValueError(
                 f"{name!r} must have samples (K, T, D) of each window, with one shape and one order of columns; item 0 "
-                f"has {kinds[0]!r:.300}, and item {other} has {kinds[other]!r:.300}"
+                f"has {kinds[0]!r:.300}{''.join(other[:1])}"
             )
         sequences, starts = (sequences, starts) if keys is None else ((), ())
         return cls(torch.stack(values, 1), keys, columns[0], sequences, starts)
@@ -354,12 +360,20 @@ def _of_arrays(arrays: Mapping[str, np.ndarray], observed: int | None) -> Foreca
             f"it contains {[*arrays][:MOST]!r:.500}; expected numbers `samples` (K, N, T, D), and the keys of "
             "the windows in `sequence`, `start` and `split`"
         )
+    if unknown := sorted(arrays.keys() - {*READ, *UNREAD}):
+        raise ValueError(f"it contains {unknown[:MOST]!r:.500}; expected only {', '.join(READ)}")
     start = arrays.get("start")
     if start is None and "step" in arrays:  # the first step of the future
         if observed is None:
             raise ValueError("it names the first step of each future; pass `observed`, or give the first of the window")
         start = arrays["step"] - observed
     keys = None
+    given = [name for name in (*NAMES["sequence"], "start", "step", "split") if name in arrays]
+    if given and (sequence is None or start is None):
+        raise ValueError(
+            f"it has the keys {given}; expected both `sequence` and `start`, or no keys if the samples are in the "
+            "order of the windows"
+        )
     if sequence is not None and start is not None:
         split = arrays.get("split", np.full(len(sequence), ""))
         if start.dtype.kind not in "iu" or not sequence.shape == start.shape == split.shape == (len(sequence),):
@@ -384,6 +398,8 @@ def _of_table(content: bytes) -> ForecastSamples:
             else f"it has no column {missing[0]!r}; expected {', '.join(AXES)}, and the columns to score"
         )
     frame = (frame if "split" in frame else frame.assign(split="")).astype(dict.fromkeys(AXES[1:], int))
+    if frame.empty:
+        raise ValueError("it has no rows; expected one for each window, sample and step")
     window, windows = pd.factorize(pd.MultiIndex.from_frame(frame[["split", "sequence", "start"]]))
     index = [window, frame["sample"], frame["ahead"]]
     table = frame.drop(columns=[*AXES, "split"]).set_index([*map(pd.Index, index)]).sort_index()

@@ -134,6 +134,7 @@ class SwitchingNetwork(Network):
     """
 
     head = Triangular
+    stationary = True
 
     def __init__(self, inputs: Sequence[Input], size: int):
         super().__init__(inputs, True, size + size**2)

@@ -96,9 +96,11 @@ def test_wrong_arguments_are_refused(capsys, folder, tmp_path):
         (["--forecasts", turned, "--axes", "kx", *data(folder)], "axes are 'kx'", 2),
         (["--forecasts", tmp_path / "absent.npz", *data(folder)], "absent.npz", 1),
         (["--forecasts", own], "--forecasts needs --data, or runs", 2),
-        (["--forecasts", own, *data(folder), "--unit", "mm"], "--unit and --root are for motion", 2),
+        (["--forecasts", own, *data(folder), "--unit", "mm"], "--unit and --given-root are for motion", 2),
         (["--forecasts", own, *data(folder), "--windows-of", "dlow"], "--windows-of is for motion", 2),
         (["--forecasts", own, "--data", "simulated"], "'own' has", 1),
+        (["--forecasts", own, *data(folder), "--root", "travel"], "--root is for motion", 2),
+        ([folder / "run", "--forecasts", own, "--root", "travel"], "the runs define the windows", 2),
         (["--forecasts", own, "--data", "simulated", "--stride", "2"], "--stride is for tables", 2),
         ([folder / "run", "--forecasts", own, "--observed", "4"], "the runs define the windows", 2),
         ([folder / "run", "--axes", "kntd"], "need --forecasts", 2),
@@ -135,3 +137,18 @@ def test_forecasts_of_motion_are_scored_in_public_layouts(capsys, tmp_path):
     assert fewer.data["windows"] < count
     assert fewer["metres"]["ADE"] == fewer["zero velocity"]["ADE"]
     assert "windows of dlow" in " ".join(capsys.readouterr().out.split())
+
+
+def test_windows_that_keep_the_root_are_scored_without_a_run(tmp_path):
+    people, out = tmp_path / "people.npz", tmp_path / "windows.npz"
+    motion.save(people, motion.simulate(clips=8, frames=90, test=0.4))
+    options = ["--data", people, "--protocol", "simulated", "--root", "travel"]
+    assert main([str(each) for each in ("data", "windows", *options, "--out", out)]) == 0
+    with np.load(out) as arrays:
+        keys = {name: arrays[name] for name in ("split", "sequence", "start", "columns")}
+        samples = arrays["observed"][None, :, -1:].repeat(3, 0).repeat(60, 2)
+    np.savez(tmp_path / "still.npz", samples=samples, **keys)
+    evaluated("--forecasts", tmp_path / "still.npz", *options, "--out", tmp_path / "scores.json")
+    scores = dvae.Evaluation.load(tmp_path / "scores.json")
+    assert samples.shape[-1] == 3 * motion.WALKER.joints
+    assert scores["still"]["ADE"] == scores["zero velocity"]["ADE"]

@@ -428,7 +428,7 @@ def test_the_state_does_not_grow(name, tmp_path):
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    "name", ["vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "dsae", "kvae", "autoregressive"]
+    "name", ["vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "dsae", "kvae", "rslds", "autoregressive"]
 )
 def test_every_method_of_the_family_filters_streams(name, tmp_path):
     x = torch.randn(3, 8, 4)
@@ -444,7 +444,9 @@ def test_every_method_of_the_family_filters_streams(name, tmp_path):
     online = name in ("vae", "storn", "vrnn", "kvae")
     if name not in ("vae", "storn", "vrnn"):  # where the guide proposes latents without any data
         assert (later.log_evidence[:, 2] == 0).all()
-    assert set(later.proposal.values()) == ({"guide"} if online else {"prior"} if model.latents else set())
+    assert {later.proposal[name] for name in model.latents} <= {"guide" if online else "prior"}
+    assert {later.proposal[name] for name in model.summed} <= {"exact"}
+    assert stream.predict().sample(2)["x"].isfinite().all()
     if online or not model.latents:
         torch.manual_seed(1)
         torch.testing.assert_close(whole.log_evidence.sum(1), fivo_bound(model, batch, 16).bound)
@@ -544,12 +546,15 @@ REFUSALS = [
     ("missing in the batch are x", lambda: start({})),
     ("leave out the other arguments", lambda: start(resume="state")),
     ("leave out the other arguments", lambda: start(None, lag=1, resume="state")),
-    ("has 2 sequences, but the update has 3", lambda: start().update(torch.zeros(3, 3))),
+    ("has 2 sequences, but the new steps have 3", lambda: start().update(torch.zeros(3, 3))),
     ("missing in the batch are x", lambda: start().update({})),
     ("leave out 'lengths'", lambda: start().update({"x": ZERO, "lengths": torch.tensor([1, 3])})),
     ("ragged batch have ended", lambda: start({"x": ZERO, "lengths": torch.tensor([2, 3])}).update(ZERO)),
     ("missing in the batch are c", lambda: start(pair_batch("context"), name="context").update(torch.zeros(3, 3))),
     ("missing in the batch are c", lambda: start(pair_batch("context"), name="context").predict()),
+    ("x is None; give the values", lambda: start().update(None)),
+    ("levels must be", lambda: start().predict().quantile(2.0)),
+    ("levels must be", lambda: start().predict().quantile([0.5, -0.1])),
     ("reads no context; leave out c", lambda: start().predict({"c": ZERO})),
     ("leave out b", lambda: start(pair_batch("context"), name="context").update(pair_batch("context"))),
     ("Linear of", lambda: start(network=Linear(3)).update(ZERO)),
@@ -563,6 +568,34 @@ REFUSALS = [
 def test_what_cannot_be_filtered_is_refused(text, call):
     with pytest.raises(ValueError, match=re.escape(text)):
         call()
+
+
+CONTEXTS = {
+    "exact": (("p(z_t | z_{t-1}, c_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)"), {"z": 2}, Dense(())),
+    "hmm": (("p(k_t | k_{t-1}, c_t) p(x_t | k_t, c_t)", ""), {"k": Discrete(2)}, None),
+    "particles": (("p(z_t | z_{t-1}, c_t) p(x_t | z_t, c_t)", "q(z_t | z_{t-1}, x_t)"), {"z": 2}, None),
+}
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", CONTEXTS)
+def test_context_of_another_shape_is_refused(name):
+    pair, sizes, network = CONTEXTS[name]
+    model = build(pair, {**sizes, "x": 3, "c": 2}, network, {"p": FixedNormal()} if name == "exact" else None)
+    stream = model.filter({"x": torch.zeros(3, 4, 3), "c": torch.zeros(3, 4, 2)})
+    assert set(stream.proposal.values()) == {"guide" if name == "particles" else "exact"}
+    for shape, message in (
+        ((1, 2), "has 3 sequences, but the new steps have 1"),
+        ((2, 2), "has 3 sequences, but the new steps have 2"),
+        ((6, 2), "has 3 sequences, but the new steps have 6"),
+        ((3, 2, 2), "of one step, got 2 steps"),
+        ((3, 3), "expected"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            stream.predict({"c": torch.zeros(shape)})
+    with pytest.raises(TypeError, match="context is a Tensor, expected a mapping"):
+        stream.predict(torch.zeros(3, 2))
+    assert stream.predict({"c": torch.zeros(3, 2)}).mean["x"].shape == (3, 3)
 
 
 def test_an_update_that_is_refused_changes_nothing():
@@ -594,6 +627,10 @@ def test_the_state_of_another_model_is_refused(tmp_path):
 def test_a_file_that_is_no_filter_is_refused(tmp_path):
     (tmp_path / "state").write_bytes(b"no safetensors")
     with pytest.raises(ValueError, match="is not a stored filter"):
+        pair_model("vrnn").filter(resume=tmp_path / "state")
+    start().save(tmp_path / "state")
+    (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:-1])
+    with pytest.raises(ValueError, match="state is damaged"):
         pair_model("vrnn").filter(resume=tmp_path / "state")
 
 

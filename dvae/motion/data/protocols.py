@@ -18,6 +18,7 @@ Decisions where papers and code differ:
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
@@ -331,6 +332,13 @@ def _divide(motion: MotionSet, protocol: Protocol) -> dict[str, list[Clip]]:
         raise ValueError(
             f"protocol {protocol.name} needs {protocol.split_by} {'/'.join(protocol.train)} for training and "
             f"{'/'.join(protocol.test)} for test; {motion.name!r} has {groups}"
+        )
+    unused = [group for _, group in values if group not in (*protocol.train, *protocol.test)]
+    if unused and protocol.split_by == "split":
+        warnings.warn(
+            f"{len(unused)} of {len(values)} clips of {motion.name!r} are not used: protocol {protocol.name} uses the "
+            f"splits {', '.join((*protocol.train, *protocol.test))}, not {', '.join(dict.fromkeys(unused)):.300}",
+            stacklevel=3,
         )
     validation = held_out(len(train), protocol.validation)
     return {

@@ -170,7 +170,7 @@ def convert(
         skip_bad: leave out unusable clips.
         missing: keep clips in which joints are missing (NaN) in some frames.
         units: metres per unit of some sources; `metres` is for the others.
-        prefix: start the names of clips with the name of their archive; for recordings, folders, and archives with
+        prefix: start the names of clips with the name of their archive or folder; for recordings, and for sources with
             equal names, with the name of the folder that contains them.
 
     Returns:
@@ -182,6 +182,8 @@ def convert(
     from joblib import Parallel, delayed
 
     format = format_of(out, format)
+    if twice := [source for n, source in enumerate(sources) if source in sources[:n]]:
+        raise ValueError(f"{twice[0]} is given twice; give each file or folder once")
     files_of_sources = [_files_of(source, len(sources) > 1) for source in sources]
     files = list(chain.from_iterable(files_of_sources))
     if units or prefix or not all(files_of_sources):
@@ -243,21 +245,24 @@ def convert(
 
 
 def _files_of(source: Path, several: bool) -> list[File]:
-    """Return the files of a source; with several sources, the folder name becomes part of the split."""
+    """Return the files of a source; with several sources, files of a folder without splits get its name as split."""
     files = find_files(source)
     return [replace(file, split=_split(file.split, source, several)) for file in files]
 
 
 def _split(split: str, source: Path, several: bool) -> str:
-    if not (several and source.is_dir()):
-        return split
-    return source.name if split == "all" else f"{source.name}/{split}"
+    return _name(source) if several and split == "all" and source.is_dir() else split
+
+
+def _name(source: Path) -> str:
+    """Return the name of a folder, or of a file without its ending."""
+    return source.absolute().name if source.is_dir() else source.stem
 
 
 def _renamed(motion: MotionSet, source: Path, sources: Sequence[Path], prefix: bool, archive: bool) -> MotionSet:
-    """Return clips whose splits start with the folder that is their source, and whose names may have a prefix."""
-    unique = archive and sum(source.stem == other.stem for other in sources) == 1
-    start = f"{source.stem if unique else source.absolute().parent.name}-" * prefix
+    """Return clips in the splits of `_files_of`, whose names may have a prefix."""
+    unique = (archive or source.is_dir()) and [*map(_name, sources)].count(_name(source)) == 1
+    start = f"{_name(source) if unique else source.absolute().parent.name}-" * prefix
     clips = [
         replace(clip, name=start + clip.name, split=_split(clip.split, source, len(sources) > 1)) for clip in motion
     ]

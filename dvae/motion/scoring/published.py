@@ -88,8 +88,8 @@ def frames_of(
         if root is None and path.any():
             raise ValueError(
                 f"the root, {skeleton.names[skeleton.root]}, moves in these forecasts, and the protocol removes it; "
-                "give root='subtract' if all joints are in one coordinate system, or root='ignore' if the others are "
-                "relative to the root"
+                "give root='subtract' (`dvae evaluate --given-root`) if all joints are in one coordinate system, or "
+                "root='ignore' if the others are relative to the root"
             )
         joints = joints - path[..., None, :] if root == "subtract" else joints
         values = skeleton.without_root(joints).flatten(-2)

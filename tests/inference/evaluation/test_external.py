@@ -178,6 +178,7 @@ WRONG = {
         lambda x, w: [x[:, n, : 2 + n % 2] for n in range(N)],
         r"item 0 has \(\(9, 2, 2\),\), and item 1 has \(\(9, 3, 2\),\)",
     ),
+    "means": (lambda x, w: list(x.mean(0)), r"samples \(K, T, D\) of each window, .*; item 0 has \(\(3, 2\),\)$"),
     "fewer named columns": (
         lambda x, w: ForecastSamples(x[..., :1], columns=["b"]),
         r"shape \(9, 7, 3, 1\), .*; its columns are \['b'\], not \['a', 'b'\]",
@@ -301,6 +302,7 @@ def test_files_that_forecasts_of_tables_wrote_are_scored_or_refused_with_a_reaso
 
 TABLES = {
     "no keys": (lambda f: f.drop(columns="start"), "no column 'start'; expected sequence, start, sample, ahead"),
+    "a header": (lambda f: f.iloc[:0], "it has no rows; expected one for each window, sample and step"),
     "a row less": (lambda f: f.iloc[1:], r"188 rows; expected one for each of 7 windows, 9 samples and 3 steps"),
     "a row twice": (lambda f: pd.concat([f.iloc[1:], f.iloc[1:2]]), "189 rows; expected one for each"),
     "steps from 0": (lambda f: f.assign(ahead=f["ahead"] - 1), "with `ahead` from 1"),
@@ -326,6 +328,35 @@ def test_a_gap_or_swapped_columns_in_a_table_is_refused(own, windows, tmp_path):
     long_table(own[0], windows).rename(columns={"a": "b", "b": "a"}).to_csv(tmp_path / "swapped.csv", index=False)
     with pytest.raises(ValueError, match=r"columns \['b', 'a'\]; expected, in this order, \['a', 'b'\]"):
         score(tmp_path / "swapped.csv", windows)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"sequence": "0"}, r"has the keys \['sequence'\]; expected both `sequence` and `start`"),
+        ({"clip": "0"}, r"has the keys \['clip'\]"),
+        ({"start": 0}, r"has the keys \['start'\]"),
+        ({"split": "test"}, r"has the keys \['split'\]"),
+        ({"start": 0, "split": "test"}, r"has the keys \['start', 'split'\]"),
+        ({"Sequence": "0", "Start": 0}, r"contains \['Sequence', 'Start'\]; expected only samples, .*sequence"),
+        ({"sequence": "0", "start": 0, "Columns": "a"}, r"contains \['Columns'\]; expected only .*columns"),
+    ],
+)
+def test_incomplete_or_misspelt_keys_are_refused(own, windows, tmp_path, keys, message):
+    np.savez(tmp_path / "theirs.npz", samples=own[0], **{name: np.full(N, value) for name, value in keys.items()})
+    with pytest.raises(ValueError, match=f"theirs.npz: it {message}"):
+        score(tmp_path / "theirs.npz", windows)
+
+
+def test_samples_without_keys_have_the_order_of_the_windows_and_a_note(own, windows, tmp_path):
+    np.savez(tmp_path / "theirs.npz", samples=own[0])
+    result, keyed = (
+        score(tmp_path / "theirs.npz", windows),
+        score(save_npz(tmp_path / "k.npz", own[0], windows), windows),
+    )
+    assert result["theirs"]["CRPS"] == keyed["theirs"]["CRPS"]
+    assert "forecasts of theirs have no keys: they are read in the order of the windows" in result.notes
+    assert not any("have no keys" in note for note in keyed.notes)
 
 
 class Pickled:

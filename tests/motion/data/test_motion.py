@@ -390,6 +390,12 @@ class TestWindows:
         with pytest.raises(KeyError, match="no clip has the label 'mood'; the labels are style"):
             test.labels("mood")
 
+    def test_clips_in_other_splits_are_left_out_with_a_warning(self):
+        clips = [replace(clip, split="walks/train") if n < 2 else clip for n, clip in enumerate(motion())]
+        message = rf"2 of {len(clips)} clips of .* are not used: .* uses the splits train, test, not walks/train$"
+        with pytest.warns(UserWarning, match=message):
+            windows(MotionSet(clips, WALKER), TINY, "test")
+
     def test_windows_that_cannot_be_cut_are_errors(self):
         others = replace(TINY, train=("S1",), test=("S2",))
         for protocol, split, length, message in (

@@ -11,10 +11,12 @@ from dvae.motion import (
     HUMAN36M,
     WALKER,
     MotionSet,
+    Protocol,
     Skeleton,
     read_motion,
     save,
     simulate,
+    windows,
     write_motion,
 )
 from dvae.motion.files.arrays import read_arrays
@@ -178,7 +180,7 @@ def test_archives_of_clips_are_joined(walkers, tmp_path, capsys):
     assert main(["data", "convert", *map(str, paths), "--out", out]) == 0
     assert read_motion(out).fingerprint() == walkers.fingerprint()
     for other, message in (
-        (paths[0], "occurs twice"),
+        (paths[0], "is given twice"),
         (folder / "z.npz", "its up axis is z, but y in"),
     ):
         save(folder / "z.npz", MotionSet([walkers.clips[0]], replace(WALKER, up="z")))
@@ -246,8 +248,25 @@ def test_clips_of_the_same_name_get_a_prefix(walkers, recordings, tmp_path, caps
     assert main(["data", "convert", *folders, "--out", out]) == 1
     assert "--prefix" in capsys.readouterr().err
     assert main(["data", "convert", *folders, "--out", out, "--prefix"]) == 0
-    assert {clip.split for clip in read_motion(out)} == {f"{recordings.name}/train", f"{recordings.name}/test"}
+    assert {clip.split for clip in read_motion(out)} == {"train", "test"}
     assert any(clip.name.startswith("d-") for clip in read_motion(out))
+
+
+def test_merged_clips_keep_their_splits(walkers, recordings, tmp_path, capsys):
+    archive, out = tmp_path / "pa.npz", tmp_path / "all.npz"
+    save(archive, walkers)
+    for options in (["--prefix"], ["--prefix", "--units", f"{recordings}/=cm", f"{tmp_path}/./pa.npz=m"]):
+        sources = [str(archive), f"{recordings}/"]
+        assert main(["data", "convert", *sources, "--out", str(out), *options]) == 0
+        merged = read_motion(out)
+        assert {clip.split for clip in merged} == {"train", "test"}
+        assert {clip.name.split("-")[0] for clip in merged} == {"pa", recordings.name}
+        protocol = Protocol("short", 2, 3, 30, train_stride=1, test_stride=1)
+        used = [clip for split in ("train+validation", "test") for clip in windows(merged, protocol, split).clips]
+        assert len(used) == len(merged) == 2 * len(walkers)
+    capsys.readouterr()
+    assert main(["data", "convert", str(archive), str(archive), "--out", str(out), "--prefix"]) == 1
+    assert "pa.npz is given twice; give each file or folder once" in " ".join(capsys.readouterr().err.split())
 
 
 def test_files_with_other_rates_or_joints_are_merged_only_on_request(walkers, tmp_path, capsys):
