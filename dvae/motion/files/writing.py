@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -216,7 +217,8 @@ def convert(
 
     def clips(stage: Path) -> Iterator[Clip]:
         work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
-        results = work(delayed(_convert_file)(reader, file, stage, format, skip_bad) for file in files)
+        here = Path.cwd()
+        results = work(delayed(_convert_file)(reader, file, stage, format, skip_bad, here) for file in files)
         with closing(results), progress_bar(True) as bar:
             for file, result in bar.track(zip(files, results, strict=True), len(files), description="clips"):
                 reason = result if isinstance(result, str) else collected.add(file.path, *result)
@@ -271,13 +273,14 @@ def _renamed(motion: MotionSet, source: Path, sources: Sequence[Path], prefix: b
 
 
 def _convert_file(
-    reader: FileReader, file: File, out: Path, format: str, skip_bad: bool
+    reader: FileReader, file: File, out: Path, format: str, skip_bad: bool, directory: Path
 ) -> tuple[Clip, Skeleton, list[str]] | str:
     """Read one file, and write its clip unless all clips go into one npz.
 
     Returns:
         Clip (its fullest frame if it was written), skeleton and notes; or the reason why the file cannot be used.
     """
+    os.chdir(directory)  # relative paths start there, and a process may be left from a call in another directory
     try:
         clip, skeleton, notes = reader(file)
         if format == "npz":

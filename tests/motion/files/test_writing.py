@@ -75,6 +75,16 @@ def test_a_converted_folder_equals_the_folder_as_read(jobs, recordings, tmp_path
     assert (converted.skeleton.name, converted.skeleton.up, converted.skeleton.fps) == ("human36m", "z", 15)
 
 
+@pytest.mark.slow
+def test_relative_paths_start_from_the_directory_of_the_call(walkers, tmp_path, monkeypatch):
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        write_motion("recordings", walkers, "bvh")
+        assert main(["data", "convert", "recordings", "--out", "out", "--format", "bvh", "--jobs", "2"]) == 0
+        assert len([*(tmp_path / name / "out").rglob("*.bvh")]) == 3
+
+
 @pytest.mark.parametrize("format", ["npz", "bvh", "csv", "amass"])
 def test_labels_are_written_with_the_clips(format, walkers, tmp_path):
     moods = [
