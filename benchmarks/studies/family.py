@@ -15,8 +15,8 @@ DIGITS = {"ADE": 3, "FDE": 3, "MMADE": 3, "MMFDE": 3, "APD": 2, "energy score": 
 ARROWS = {"ADE": " ↓", "FDE": " ↓", "MMADE": " ↓", "MMFDE": " ↓", "energy score": " ↓"}
 
 
-def tables(comparison: dvae.Comparison) -> dict[str, Table]:
-    """Return the teacher-forced scores in the order of the ranking, then free-running ones by energy score."""
+def tables(comparison: dvae.Comparison, suffix: str = "") -> dict[str, Table]:
+    """Return the teacher-forced scores in the order of the ranking, then free-running ones by energy score, if any."""
     best, *_ = ranking = comparison.ranking
 
     def latents(name: str) -> str:
@@ -40,23 +40,24 @@ def tables(comparison: dvae.Comparison) -> dict[str, Table]:
         )
         for score, digits in DIGITS.items()
     }
-    order = ordered({name: name for name in ranking}, lambda name: comparison[name]["energy score"].mean)
     windows = f"Teacher-forced, nats a frame ({len(comparison.keys)} windows)."
-    draws = f"Free-running, {comparison.samples} forecasts a window, metres."
-    return {
-        "family/teacher-forced": tabled({name: name for name in ranking}, forced, note=windows),
-        "family/free-running": tabled(order, free, note=draws),
-    }
+    result = {f"family/teacher-forced{suffix}": tabled({name: name for name in ranking}, forced, note=windows)}
+    if all("energy score" in comparison[name] for name in ranking):
+        order = ordered({name: name for name in ranking}, lambda name: comparison[name]["energy score"].mean)
+        draws = f"Free-running, {comparison.samples} forecasts a window, metres."
+        result[f"family/free-running{suffix}"] = tabled(order, free, note=draws)
+    return result
 
 
-def main(files: tyro.conf.Positional[tuple[Path, ...]], results: Path | None = None) -> None:
+def main(files: tyro.conf.Positional[tuple[Path, ...]], results: Path | None = None, suffix: str = "") -> None:
     """Write the tables.
 
     Args:
         files: files written by `dvae compare --out`.
         results: folder of the tables, such as benchmarks/results; None prints them.
+        suffix: end of the names of the tables.
     """
-    write(results, tables(reduce(dvae.Comparison.join, map(dvae.Comparison.load, files))))
+    write(results, tables(reduce(dvae.Comparison.join, map(dvae.Comparison.load, files)), suffix))
 
 
 if __name__ == "__main__":
