@@ -26,12 +26,14 @@ def tables(comparison: dvae.Comparison, suffix: str = "") -> dict[str, Table]:
         )
 
     forced: dict[str, Callable[[str], str]] = {
-        f"IWAE bound, K = {comparison.particles}": lambda name: format_mean(comparison[name]["IWAE bound"], 2),
+        "IWAE bound": lambda name: format_mean(comparison[name]["IWAE bound"], 2),
         "difference to the best": lambda name: format_mean(
             None if name == best else comparison.difference(name, best), 2
         ),
         "ELBO": lambda name: f"{comparison[name]['ELBO'].mean:.2f}",
-        "k-hat > 0.7": lambda name: f"{100 * comparison.rows[name].unreliable:.0f} %",
+        "k-hat > 0.7": lambda name: (
+            f"{100 * comparison.rows[name].unreliable:.0f} %" if comparison.particles > 1 else "–"
+        ),
         "KL in nats a frame, active units": latents,
     }
     free = {
@@ -40,7 +42,7 @@ def tables(comparison: dvae.Comparison, suffix: str = "") -> dict[str, Table]:
         )
         for score, digits in DIGITS.items()
     }
-    windows = f"Teacher-forced, nats a frame ({len(comparison.keys)} windows)."
+    windows = f"Teacher-forced, nats a frame ({len(comparison.keys)} windows); K = {comparison.particles}."
     result = {f"family/teacher-forced{suffix}": tabled({name: name for name in ranking}, forced, note=windows)}
     if all("energy score" in comparison[name] for name in ranking):
         order = ordered({name: name for name in ranking}, lambda name: comparison[name]["energy score"].mean)
