@@ -31,6 +31,7 @@ from ..motion.data.dataset import SIMULATED
 from ..motion.data.protocols import Representation, RootMotion
 from ..motion.segments.dataset import Segmentation
 from ..options import Amount, Frames, Share
+from ..program.model import DynamicalVAE
 from ..runs import directory as runs
 from ..runs.grid import Grid
 from ..runs.kinds import DATA
@@ -382,7 +383,13 @@ def _report(result: Fit) -> None:
     method = Run(result.run).config["method"]
     if method.get("units") not in (None, "columns"):
         OUT.print(f"targets are in the units {method['units']!r} (--units)", highlight=False)
-    OUT.print(_use(method["method"], result.run), highlight=False, soft_wrap=True)
+    can_forecast = not isinstance(result.model, DynamicalVAE) or result.model.can_forecast
+    use = _use(method["method"], result.run) if can_forecast else _compare(result.run)
+    OUT.print(use, highlight=False, soft_wrap=True)
+
+
+def _compare(run: Path) -> str:
+    return f"the model has no forecasts; compare its bound with: dvae compare {run} --no-forecasts"
 
 
 def _use(name: str, run: Path) -> str:

@@ -236,6 +236,9 @@ class RandomGiven:
     source: Any
     observed: int | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "source", as_source(self.source))
+
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Return a batch of the source with the entry "given" (B, T, D)."""
         batch = Batch(self.source.sample(batch_size, generator))

@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from pyro.distributions.torch_distribution import TorchDistribution
@@ -31,6 +31,7 @@ from torch.distributions import Normal, constraints
 from torch.nn import functional
 from typing_extensions import override
 
+from ..options import Count, Extra, Positive, Range, require
 from .base import ConditionalDistribution, Parameters, Shape
 
 GOLDEN = (math.sqrt(5) - 1) / 2
@@ -111,6 +112,7 @@ class Diffusion:
         Raises:
             ValueError: an option is out of range or does not fit the variable.
         """
+        require(Positive, min_scale=self.min_scale)
         if self.schedule not in ("learned", "cosine") or self.sampler not in ("ancestral", "ddim", "heun"):
             raise ValueError(
                 "a Diffusion has the schedule 'learned' or 'cosine' and the sampler 'ancestral', 'ddim' or 'heun', got "
@@ -194,11 +196,10 @@ class DenoisingModule(ConditionalDistribution):
 
     def __init__(self, spec: Any, shape: Shape):
         super().__init__(spec.residual)
-        if spec.steps < 1 or not 0 <= spec.drop < 1:
-            raise ValueError(
-                f"{type(spec).__name__} needs `steps` of at least 1 and `drop` from 0 to below 1, got "
-                f"steps={spec.steps} and drop={spec.drop}"
-            )
+        if not isinstance(spec.hidden, tuple):
+            raise TypeError(f"`hidden` is {spec.hidden!r}; expected a tuple of widths, such as (128, 128)")
+        require(Count, steps=spec.steps)
+        require(Annotated[float, Range(0, 1, below=True)], drop=spec.drop)
         if spec.guidance != 1 and not spec.drop:
             raise ValueError(
                 f"guidance={spec.guidance} needs an unconditional denoiser; set `drop` above 0, such as drop=0.1"
@@ -338,7 +339,9 @@ class DenoisingModule(ConditionalDistribution):
             log_det = log_det + h / 6 * (d1 + 2 * d2 + 2 * d3 + d4)
         each = counted * (-0.5 * (z.square() + math.log(2 * math.pi)) - scale.log() + shrink.log())
         log_probs = each.sum(tuple(range(-event, 0))) + log_det
-        error = log_probs.std(0) / math.sqrt(probes) if probes > 1 else torch.zeros_like(log_probs[0])
+        error = torch.full_like(log_probs[0], 0.0 if probes == 0 else math.nan)
+        if probes > 1:
+            error = log_probs.std(0) / math.sqrt(probes)
         return ODEDensity(log_probs.mean(0).detach(), error.detach())
 
 
@@ -468,11 +471,6 @@ class DenoisingDistribution(TorchDistribution):
         """Real vectors, or real numbers if all steps are drawn jointly."""
         return constraints.independent(constraints.real, self.module.event_dim)
 
-    def _shifted_range(self) -> tuple[Tensor, Tensor]:
-        """Return the lowest and highest angle of the cosine schedule without its shift."""
-        low, high = ((end + self.spec.shift) / 2 for end in self.noise_range)
-        return low.exp().atan(), high.exp().atan()
-
     @property
     def density(self) -> str:
         """What `log_prob` returns, as in `ConditionalDistribution.present_density`."""
@@ -503,9 +501,14 @@ class DenoisingDistribution(TorchDistribution):
                 needs one backward pass per coordinate. None is exact for up to 64 coordinates, 16 probes above.
 
         Returns:
-            Log density (...) and standard error (...) over the directions, 0 for an exact trace. If all steps are
-            drawn jointly, both are (B,), for all observed steps.
+            Log density (...) and standard error (...) over the directions, 0 for an exact trace, NaN for one direction.
+            If all steps are drawn jointly, both are (B,), for all observed steps.
+
+        Raises:
+            ValueError: when `steps` is below 1, or `probes` below 0.
         """
+        require(Count, steps=steps)
+        require(Extra, probes=probes or 0)
         return self.module.exact_log_prob(self.parameters, value, steps, probes)
 
     def expand(self, batch_shape: Any, _instance: object = None) -> DenoisingDistribution:

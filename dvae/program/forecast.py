@@ -42,6 +42,7 @@ def forecast(
     """
     require(Count, horizon=horizon, samples=samples)
     require(Annotated[int, Range(1)], chunk=chunk)
+    require_forecasts(model)
     if model.view.given:
         return _forecast_given(model, batch, horizon, samples, draw_emission, fix, chunk)
     data = model.read(batch)
@@ -99,6 +100,21 @@ def forecast(
     distinct = samples if model.latents or model.summed or redrawn or draw_data else 1
     out = in_chunks(futures, size, distinct, _chunk_size(model, data, size, chunk))
     return out if distinct == samples else {name: value.repeat(samples, 1, 1, 1) for name, value in out.items()}
+
+
+def require_forecasts(model: Any) -> None:
+    """Refuse a model that draws all steps of data jointly without their past as context.
+
+    Raises:
+        ValueError: when the model is such a one.
+    """
+    if not model.can_forecast:
+        name = next(name for name in model.observed if model.generator[name].joint)
+        raise ValueError(
+            f"{model.generator[name].factor} draws all steps of {name} jointly, and not given some of them, so "
+            "the model cannot forecast. Make the past context (dvae.data.views.Past), or use a distribution of single "
+            'steps. Bounds need no forecasts: select="bound" (--select bound), dvae compare --no-forecasts'
+        )
 
 
 def _forecast_given(

@@ -322,6 +322,7 @@ class DynamicalVAE(nn.Module):
                 f"got distributions of {', '.join(distributions) or 'nothing'}; expected factors of latents, which are "
                 f"{names or 'missing in this model'}"
             )
+        _by_factor(distributions, Normal(), "distribution")
         if "encoder" not in self._modules:
             raise ValueError("the guide is the prior, so a new prior would replace both; give the model a guide")
         model = copy.deepcopy(self).requires_grad_(False)
@@ -356,6 +357,11 @@ class DynamicalVAE(nn.Module):
         """
         heads = [self.generator[name].head for name in self.observed]
         return not any(head.deterministic or head.density == "loss" for head in heads)
+
+    @property
+    def can_forecast(self) -> bool:
+        """Whether the model continues sequences; a joint distribution of all steps needs their past as context."""
+        return bool(self.view.past or self.view.given) or not any(self.generator[n].joint for n in self.observed)
 
     @property
     def bounded(self) -> tuple[str, ...]:

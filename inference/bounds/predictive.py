@@ -17,8 +17,8 @@ score, less so with more particles, and not at all if both guides are posteriors
 With missing entries, it is the density of the observed entries of x_{O+1:T}, given the observed ones of x_{1:O}. A
 model that reads its own past reads its means at missing entries, as in the bounds.
 
-If the model is one factor with a `distributions.Diffusion`, the score is its density by the probability-flow ODE, and
-not a bound.
+If the model is one factor with a `distributions.Diffusion` or `FlowMatching`, the score is its density by the
+probability-flow ODE, and not a bound.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from dataclasses import replace
 
 import torch
 from pyro import poutine
-from torch import Tensor
+from torch import Tensor, nn
 
 from ...data.batch import Batch
-from ...distributions.diffusion import DiffusionModule
+from ...distributions.diffusion import DenoisingModule
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence
@@ -58,9 +58,11 @@ def predictive_bound(
         ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no step is
             left to observe or to predict.
     """
-    is_diffusion = _is_one_diffusion(model)
-    if not is_diffusion:
+    is_denoiser = is_one_denoiser(model)
+    if not is_denoiser:
         require_densities(model)
+    elif (guidance := next(iter(model.generator.values())).head.spec.guidance) != 1:
+        raise ValueError(f"forecasts with guidance={guidance} do not follow a known density; omit the log score")
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
         raise ValueError(
             f"{type(model).__name__} has a custom forecast, whose density is not known; omit the log score"
@@ -104,7 +106,7 @@ def predictive_bound(
             future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
             return total(future) + total(log_densities(past_guide)) - total(log_densities(proposed))
 
-        if is_diffusion:
+        if is_denoiser:
             density = _ode_density(model, data, observed)
             result = IWAEBound(density, torch.full_like(density, math.nan), particles)
         else:
@@ -112,11 +114,12 @@ def predictive_bound(
         return replace(result, bound=result.bound + log_det[:, observed:].sum(1).to(result.bound))
 
 
-def _is_one_diffusion(model: DynamicalVAE) -> bool:
-    """Return whether the model is one local factor with a `Diffusion` whose draws follow its density."""
+def is_one_denoiser(model: nn.Module) -> bool:
+    """Return whether the model is one local factor with a `Diffusion` or `FlowMatching`, which have an ODE."""
+    if not isinstance(model, DynamicalVAE):
+        return False
     first, *others = model.generator.values()
-    is_alone = not others and first.factor.local and first.offset is None
-    return is_alone and isinstance(first.head, DiffusionModule) and first.head.spec.guidance == 1
+    return not others and first.factor.local and first.offset is None and isinstance(first.head, DenoisingModule)
 
 
 def _ode_density(model: DynamicalVAE, data: Batch, observed: int) -> Tensor:

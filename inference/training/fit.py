@@ -116,9 +116,10 @@ class Fit:
         advice, model = ["train for more steps"], self.model
         if isinstance(model, DynamicalVAE) and _reads_past_data(model):
             heads = [model.generator[name].head for name in model.observed]
-            if not any(head.residual or isinstance(head, FamilyModule | ProductModule) for head in heads):
+            joint = any(model.generator[name].joint for name in model.observed)
+            if not joint and not any(head.residual or isinstance(head, FamilyModule | ProductModule) for head in heads):
                 advice.append("try residual=1, which adds the output to the last value")
-            if not scheduled:
+            if not (joint or scheduled):
                 advice.append("try scheduled_sampling=1, which trains on the model's own output")
         return f"{best}, worse than repeating the last value ({self.last_value:.3f}): {', or '.join(advice)}"
 

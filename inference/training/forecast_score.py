@@ -14,6 +14,8 @@ from torch import Tensor
 
 from ...data.batch import Batch
 from ...data.sequences import as_batches, mean_of_known, tensor_of
+from ...program.forecast import require_forecasts
+from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting, Forecasting
 from ..evaluation.evaluation_windows import on_device_of, seeded_evaluation
 from ..evaluation.metrics import continuous_ranked_probability_score
@@ -39,6 +41,8 @@ def observed_steps(model: Any, windows: Any) -> int:
             f'select is "forecast", but got {problem}; give a model that forecasts, and validation windows such as '
             'dvae.ArrayWindows(x, observed=…), or set select="bound"'
         )
+    if isinstance(model, DynamicalVAE):
+        require_forecasts(model)
     return observed
 
 

@@ -88,8 +88,12 @@ class Equations(LatentMethod):
     def distributions(self) -> Mapping[str, DistributionSpec]:
         """Return the distributions of x and of static latents."""
         distributions = super().distributions()
-        if self.emission != "diffusion" or not re.search(r"p\(\s*x_\{1:T\}", self.generative):
+        if self.emission != "diffusion" or "p(x_{1:T}" not in "".join(self.generative.split()):
             return distributions
+        if self.residual:
+            raise ValueError(
+                f"residual is {self.residual}, but a diffusion of all steps has no previous value; leave it at 0"
+            )
         x = self.equations()[0].factor("x")
         frequencies = all(parent.relation in (None, ALL) for parent in x.parents if parent.name != "x")
         denoiser = Denoiser(SelfAttention(self.width, positions="sinusoids"), "cosine" if frequencies else None)

@@ -59,6 +59,9 @@ def test_the_density_of_the_ode_is_exact_and_its_estimate_is_within_its_error(sp
     exact = module.distribution(parameters(40)).exact_log_prob(x, steps=100)
     torch.testing.assert_close(exact.log_prob, DATA.log_prob(x), rtol=0, atol=2e-3)
     assert (exact.standard_error == 0).all()
+    assert module.distribution(parameters(40)).exact_log_prob(x, steps=2, probes=1).standard_error.isnan().all()
+    with pytest.raises(ValueError, match="steps is 0"):
+        module.distribution(parameters(40)).exact_log_prob(x, steps=0)
     estimate = module.distribution(parameters(40)).exact_log_prob(x, steps=100, probes=64)
     score = (estimate.log_prob - exact.log_prob) / estimate.standard_error
     assert score.square().mean().sqrt() < 1.5
@@ -398,9 +401,12 @@ def test_a_predictor_forecasts_whole_futures():
 def test_the_log_score_of_one_factor_is_its_density():
     spec, view = Diffusion(denoiser=JOINT, steps=2), dvae.data.views.Past("s", 3)
     whole = dvae.DynamicalVAE("p(x_{1:T} | s)", "", {"x": 2, "s": 6}, distributions={"p(x)": spec}, view=view)
-    steps = dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2}, distributions={"p(x)": Diffusion(hidden=(4,))})
+    step, flow = (
+        dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2}, distributions={"p(x)": each})
+        for each in (Diffusion(hidden=(4,)), FlowMatching(hidden=(4,)))
+    )
     x = torch.randn(4, 8, 2)
-    for model, given in ((whole, {"x": x[:, 3:], "s": x[:, :3].flatten(1)}), (steps, {"x": x})):
+    for model, given in ((whole, {"x": x[:, 3:], "s": x[:, :3].flatten(1)}), (step, {"x": x}), (flow, {"x": x})):
         run = model.rollout(given)
         density = run.evaluate("x", given["x"]).exact_log_prob(given["x"]).log_prob
         expected = density if model is whole else density[:, 3:].sum(1)
@@ -408,8 +414,11 @@ def test_the_log_score_of_one_factor_is_its_density():
     joint = dvae.DynamicalVAE("p(x_{1:T})", "", {"x": 2}, distributions={"p(x)": spec})
     with pytest.raises(ValueError, match="make the past context"):
         predictive_bound(joint, x, 3)
+    row = dvae.evaluate({"flow": flow}, dvae.ArrayWindows(x, observed=3), samples=2, log_score_particles=1)["flow"]
+    assert row["log score"].mean == pytest.approx(predictive_bound(flow, x, 3).bound.mean().item() / 5)
+    assert "ELBO" not in row
     guided = Diffusion(hidden=(4,), drop=0.1, guidance=2.0)
-    with pytest.raises(ValueError, match="stochastic lower bound"):
+    with pytest.raises(ValueError, match=r"guidance=2.0 do not follow a known density; omit the log score"):
         predictive_bound(dvae.DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2}, distributions={"p(x)": guided}), x, 3)
 
 
@@ -457,7 +466,12 @@ def test_a_loss_is_an_energy_and_has_no_bound():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Diffusion(steps=0).build(Shape(2)), "`steps` of at least 1"),
+        (lambda: Diffusion(steps=0).build(Shape(2)), "steps is 0; it must be at least 1"),
+        (lambda: Diffusion(min_scale=0.0).build(Shape(2)), "min_scale is 0.0; it must be finite and above 0"),
+        (
+            lambda: joint("p(z) p(x_{1:T} | z)", "q(z | x_{1:T})").forecast(torch.randn(1, 3, 2), 2),
+            "so the model cannot forecast",
+        ),
         (lambda: Diffusion(schedule="linear").build(Shape(2)), "schedule"),
         (lambda: Diffusion(shift=1.0).build(Shape(2)), "a learned schedule has none"),
         (lambda: Diffusion(loss="velocity").build(Shape(2)), "'velocity' with schedule='cosine'"),
@@ -480,6 +494,8 @@ def test_mistakes_are_refused(build, message):
 
 
 def test_a_network_is_not_a_denoiser():
+    with pytest.raises(TypeError, match="tuple of widths"):
+        Diffusion(hidden=32).build(Shape(2))
     with pytest.raises(TypeError, match="such as networks"):
         joint("p(z) p(x_{1:T} | z)", "q(z | x_{1:T})", {"p(x)": Diffusion(denoiser=SelfAttention())})
 

@@ -460,6 +460,24 @@ def test_entry_points_add_methods_but_cannot_replace_one(monkeypatch):
         dvae.methods.cache_clear()
 
 
+# ------------------------------------------------------------------------------------------ diffusion of all steps
+
+
+def test_equations_of_all_steps_have_one_diffusion_and_forecast_only_with_context():
+    options = {"inference": "", "emission": "diffusion", "width": 16, "warm_up": 0}
+    method = dvae.method("equations", generative="p( x_{1 :T} )", **options)
+    assert method.build({"x": 2}).generator["x"].joint
+    assert not dvae.method("equations", generative="p(x_t | x_{<t})", **options).build({"x": 2}).generator["x"].joint
+    with pytest.raises(ValueError, match=r"residual is 1\.0, but a diffusion of all steps has no previous"):
+        dvae.method("equations", generative="p(x_{1:T})", residual=1.0, **options).build({"x": 2})
+    windows = dvae.ArrayWindows(torch.randn(8, 6, 2), observed=4)
+    with pytest.raises(ValueError, match=r"draws all steps of x jointly.*--select bound"):
+        dvae.fit(method, windows, windows, steps=2, select="forecast", progress=False)
+    fit = dvae.fit(method, windows, windows, steps=2, select="bound", progress=False)
+    assert "residual" not in fit.best
+    assert dvae.compare({"whole": fit.model}, windows, samples=0, progress=False)["whole"]["ELBO"].mean < 0
+
+
 # ---------------------------------------------------------------------------------------------------- real motion
 
 

@@ -155,7 +155,8 @@ def graphs(runs: Runs) -> Section:
         generative = _graph_picture(model.generative.draw(STEPS, observed=model.observed), "model")
         if not model.inference.factors:
             reason = "All latents are summed out" if model.summed else "Nothing is latent"
-            return generative + paragraph(f"{reason}: there is no guide, and the bound is the log evidence.")
+            exact = "a lower bound of the density of x" if model.bounded else "the log evidence"
+            return generative + paragraph(f"{reason}: there is no guide, and the bound is {exact}.")
         findings = audit(model.generative, model.inference, observed=model.observed, summed=model.summed)
         return (
             side_by_side(generative, _graph_picture(findings.draw(STEPS), "guide"))
