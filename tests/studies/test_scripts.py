@@ -159,6 +159,10 @@ def test_family(folder, out):
     forced, free = tables(out, "family/teacher-forced", "family/free-running")
     assert {row[0] for row in forced[1:]} == {row[0] for row in free[1:]} == {"vae", "dkf"}
     assert forced[1][2] == "–"
+    dvae("compare", run, "--particles", 2, "--no-forecasts", "--out", file)
+    family.main((file,), out, "-bounds")
+    assert [row[0] for row in tables(out, "family/teacher-forced-bounds")[0][1:]] == ["dkf"]
+    assert not (out / "family/free-running-bounds.csv").exists()
 
 
 def test_bones(folder, out):
