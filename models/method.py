@@ -291,7 +291,8 @@ class LatentMethod(LikelihoodMethod):
     @override
     def objective(self) -> Objective:
         """Return the objective of training."""
-        weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=self.warm_up) if self.warm_up else 1.0
+        steps = self.warm_up if self.equations()[1].factors else None
+        weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=steps) if steps else 1.0
         return Evidence(kl_weight=weight, free_bits=self.free_bits)
 
 

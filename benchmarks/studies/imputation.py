@@ -79,11 +79,19 @@ def scores(draws: Tensor, truth: Tensor, hidden: Tensor, sequences: list[str]) -
         COVERAGE: (inside * hidden).sum((1, 2)) / hidden.sum((1, 2)),
     }
     numbers = hidden.sum((1, 2)).double()
-    places = {name: [n for n, each in enumerate(sequences) if each == name] for name in dict.fromkeys(sequences)}
+    places = {name: [n for n, each in enumerate(sequences) if each == name] for name in hidden_by(sequences, hidden)}
     return {
         score: [float((values.nan_to_num()[rows] @ numbers[rows]) / numbers[rows].sum()) for rows in places.values()]
         for score, values in by_window.items()
     }
+
+
+def hidden_by(sequences: list[str], hidden: Tensor) -> dict[str, int]:
+    """Return the number of hidden entries of each sequence that has some."""
+    numbers = dict.fromkeys(sequences, 0)
+    for sequence, number in zip(sequences, hidden.sum((1, 2)).tolist(), strict=True):
+        numbers[sequence] += number
+    return {sequence: number for sequence, number in numbers.items() if number}
 
 
 def interpolated(name: str, part: str) -> Tensor:
@@ -124,10 +132,7 @@ def run(name: str, part: str, case: str, seed: int, out: Path) -> dict[str, Any]
     logarithm, scale = units(name)
     by_row = {OURS: transformed(draws, logarithm) / scale, LINEAR: interpolated(name, part)}
     rows = {row: scores(each, truth, hidden, sequences) for row, each in by_row.items()}
-    weights = dict.fromkeys(sequences, 0.0)
-    for sequence, number in zip(sequences, hidden.sum((1, 2)).tolist(), strict=True):
-        weights[sequence] += number
-    return {"seconds": fit.processor_seconds, **scores_of(weights, rows)}
+    return {"seconds": fit.processor_seconds, **scores_of(hidden_by(sequences, hidden), rows)}
 
 
 def table(measured: Mapping[str, Mapping[str, Row]], part: str) -> Table:

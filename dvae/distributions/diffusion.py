@@ -217,7 +217,7 @@ class DenoisingModule(ConditionalDistribution):
                 f"{'has a residual' if spec.residual else 'is not the only variable of a factor p(x_{1:T} | ...)'}; "
                 "use denoiser=None"
             )
-        self.spec, self.joint_steps = spec, spec.joint
+        self.spec, self.joint_steps, self.guidance = spec, spec.joint, spec.guidance
         self.event_dim = 0 if spec.joint else 1
         self.denoiser: Any = spec.denoiser.build(shape) if spec.joint else StepDenoiser(spec.hidden, shape)
         self.hidden_features = nn.Parameter(torch.zeros(shape.features)) if spec.drop else None

@@ -103,13 +103,13 @@ def forecast(
 
 
 def require_forecasts(model: Any) -> None:
-    """Refuse a model that draws all steps of data jointly without their past as context.
+    """Refuse a model that draws all steps of a variable jointly, without their past as context.
 
     Raises:
-        ValueError: when the model is such a one.
+        ValueError: when the model cannot forecast.
     """
     if not model.can_forecast:
-        name = next(name for name in model.observed if model.generator[name].joint)
+        name = next(name for name, each in model.generator.items() if each.joint)
         raise ValueError(
             f"{model.generator[name].factor} draws all steps of {name} jointly, and not given some of them, so "
             "the model cannot forecast. Make the past context (dvae.data.views.Past), or use a distribution of single "

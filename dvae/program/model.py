@@ -312,11 +312,15 @@ class DynamicalVAE(nn.Module):
             >>> dvae.fit(second, x, steps=3, progress=False).status
             'finished'
         """
-        new = {factor.child: factor for key in distributions for factor in Factorization.parse(key).factors}
         old = {name: self.generative.factor(name) for name in self.latents}
-        new |= {name: factor for name, factor in old.items() if f"p({name})" in distributions}
-        misfits = [name for name, factor in new.items() if name not in old or factor.local != old[name].local]
-        if len(new) != len(distributions) or not new or misfits:
+        new: dict[str, Factor] = {}
+        for key in distributions:
+            short = [factor for name, factor in old.items() if key == f"p({name})"]
+            factor, *others = short or Factorization.parse(key).factors
+            replaced = None if others or factor.kind != "p" else old.get(factor.child)
+            if replaced and replaced.local == factor.local:
+                new[factor.child] = factor
+        if len(new) != len(distributions) or not new:
             names = ", ".join(map(str, old.values()))
             raise ValueError(
                 f"got distributions of {', '.join(distributions) or 'nothing'}; expected factors of latents, which are "
@@ -361,7 +365,7 @@ class DynamicalVAE(nn.Module):
     @property
     def can_forecast(self) -> bool:
         """Whether the model continues sequences; a joint distribution of all steps needs their past as context."""
-        return bool(self.view.past or self.view.given) or not any(self.generator[n].joint for n in self.observed)
+        return bool(self.view.past or self.view.given) or not any(each.joint for each in self.generator.values())
 
     @property
     def bounded(self) -> tuple[str, ...]:

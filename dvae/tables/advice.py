@@ -175,7 +175,7 @@ def _leaks(columns: Sequence[Column], values: np.ndarray, owners: np.ndarray) ->
             is_first, text, remedy = b > a or other.role != "target", "", f", or make it past (--past {other.name})"
             lag = _lag(values[:, a], values[:, b], owners) if is_first else 0
             if lag < 0:
-                text, remedy = f"equals {target.name!r} {-lag} steps later", ""
+                text, remedy = f"equals {target.name!r} {_steps(-lag)} later", ""
             elif other.role == "past":
                 continue
             elif is_first and abs(ranked[a, b]) > SAME and abs(ranked[size + a, size + b]) > SAME_CHANGE:
@@ -185,10 +185,14 @@ def _leaks(columns: Sequence[Column], values: np.ndarray, owners: np.ndarray) ->
             elif ranked[a, size + b] > SAME:
                 text = f"is a running total of {target.name!r}"
             elif lag:
-                text = f"equals {target.name!r} {lag} steps before"
+                text = f"equals {target.name!r} {_steps(lag)} before"
             if text:
                 which = "one of them" if remedy or other.role == "target" else "it"
                 yield f"{other.name!r} {text}; leave {which} out (--columns){remedy}"
+
+
+def _steps(number: int) -> str:
+    return f"{number} step{'s' * (number > 1)}"
 
 
 def _is_step(values: np.ndarray, source: np.ndarray) -> bool:
@@ -217,9 +221,11 @@ def _lag(source: np.ndarray, values: np.ndarray, owners: np.ndarray) -> int:
         return int(lags[counts.argmax()])
     rows = 1 + np.flatnonzero((np.diff(source) != 0) & ~np.isnan(np.diff(source)) & (np.diff(owners) == 0))
     for lag in sorted(set(range(-NEAR, NEAR + 1)) - {0}, key=abs):
-        inside = rows[(rows + lag >= 0) & (rows + lag < len(values))]
-        known = inside[(owners[inside + lag] == owners[inside]) & ~np.isnan(values[inside + lag])]
-        if len(known) >= REPEATS and (values[known + lag] == source[known]).mean() > 1 - SPIKE:
+        inside = rows[(rows + lag >= 1) & (rows + lag < len(values))]
+        pairs = np.stack([inside + lag - 1, inside + lag])
+        known = inside[((owners[pairs] == owners[inside]) & ~np.isnan(values[pairs])).all(0)]
+        same = (values[known + lag] == source[known]) & (values[known + lag - 1] == source[known - 1])
+        if len(known) >= REPEATS and same.mean() > 1 - SPIKE:
             return lag
     return 0
 

@@ -58,11 +58,10 @@ def predictive_bound(
         ValueError: when the model has no likelihood or a custom forecast method, the batch is ragged, or no step is
             left to observe or to predict.
     """
-    is_denoiser = is_one_denoiser(model)
-    if not is_denoiser:
+    if not (integrates := has_ode(model)):
+        if guidance := [g for each in model.generator.values() if (g := getattr(each.head, "guidance", 1)) != 1]:
+            raise ValueError(f"forecasts with guidance={guidance[0]} do not follow a known density; omit the log score")
         require_densities(model)
-    elif (guidance := next(iter(model.generator.values())).head.spec.guidance) != 1:
-        raise ValueError(f"forecasts with guidance={guidance} do not follow a known density; omit the log score")
     if type(model).forecast is not DynamicalVAE.forecast or model.view.history is not None:
         raise ValueError(
             f"{type(model).__name__} has a custom forecast, whose density is not known; omit the log score"
@@ -106,7 +105,7 @@ def predictive_bound(
             future = {n: log[:, observed:] for n, log in log_densities(joint).items() if n in local}
             return total(future) + total(log_densities(past_guide)) - total(log_densities(proposed))
 
-        if is_denoiser:
+        if integrates:
             density = _ode_density(model, data, observed)
             result = IWAEBound(density, torch.full_like(density, math.nan), particles)
         else:
@@ -114,12 +113,13 @@ def predictive_bound(
         return replace(result, bound=result.bound + log_det[:, observed:].sum(1).to(result.bound))
 
 
-def is_one_denoiser(model: nn.Module) -> bool:
-    """Return whether the model is one local factor with a `Diffusion` or `FlowMatching`, which have an ODE."""
+def has_ode(model: nn.Module) -> bool:
+    """Return whether the model is one local factor with a `Diffusion` or `FlowMatching` whose draws follow its ODE."""
     if not isinstance(model, DynamicalVAE):
         return False
     first, *others = model.generator.values()
-    return not others and first.factor.local and first.offset is None and isinstance(first.head, DenoisingModule)
+    is_alone = not others and first.factor.local and first.offset is None
+    return is_alone and isinstance(first.head, DenoisingModule) and first.head.guidance == 1
 
 
 def _ode_density(model: DynamicalVAE, data: Batch, observed: int) -> Tensor:

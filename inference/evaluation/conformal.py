@@ -136,14 +136,15 @@ class PredictionBands(Result):
             ValueError: if bands adapt, and the windows have no times, or a calibration future of the same sequence
                 ends after the origin of a window.
         """
-        until = self.data.get("until", {})
-        now = _origins_of(windows)[:, 0].tolist() if until else []
-        early = sum(time < until.get(key[1], time) for key, time in zip(windows.keys, now, strict=bool(until)))
-        if early:
-            raise ValueError(
-                f"{early} of {len(now)} windows start before the calibration futures of their sequence end, so "
-                "these prediction bands have seen their values; leave these windows out, or calibrate on earlier ones"
-            )
+        if until := self.data.get("until"):
+            now = _origins_of(windows)[:, 0].tolist()
+            early = sum(time < until.get(key[1], time) for key, time in zip(windows.keys, now, strict=True))
+            if early:
+                raise ValueError(
+                    f"the futures of {early} of {len(now)} windows begin before the last calibration step of their "
+                    "sequence, so these prediction bands have seen their values; leave these windows out, or calibrate "
+                    "on earlier ones"
+                )
         scales, units = torch.tensor(scales_of(windows) or 1.0), {*columns_of(windows).values()}
         unit = "scales" if scales.ndim else units.pop() if len(units) == 1 else ""
         percent, least = f"{100 * self.level:g} %", {"raw": max(3, _min_count(self.level)), "calibrated": 1}

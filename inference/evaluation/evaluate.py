@@ -29,7 +29,7 @@ from ...options import Count, Delay, require
 from ...program.model import DynamicalVAE
 from ...program.protocols import Emitting, Forecasting
 from ..bounds.elbo import SequenceELBO, bound_notes, iwae_bound
-from ..bounds.predictive import is_one_denoiser, predictive_bound
+from ..bounds.predictive import has_ode, predictive_bound
 from .baselines import Forecaster
 from .evaluation import Evaluation, Row
 from .evaluation_windows import EvaluationWindows, on_device_of, prepare_windows, refuse_non_finite, seeded_evaluation
@@ -153,7 +153,7 @@ def evaluate(
             if each.likelihood:
                 with seeded_evaluation(each, seed):
                     cluster_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"))
-            if each.likelihood or is_one_denoiser(each):
+            if each.likelihood or has_ode(each):
                 with seeded_evaluation(each, seed):
                     cluster_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"))
             equations = {"generative": each.generative.text, "inference": each.inference.text}

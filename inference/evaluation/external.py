@@ -4,8 +4,8 @@
 
 | file | content |
 |---|---|
-| npz | `samples` (K, N, T, D); keys `sequence`, `start`, optionally `split` (N,), or as npy; maybe `columns` (D,) |
-| npy | samples (K, N, T, D), with the windows in the order of the evaluation |
+| npz | `samples` (K, N, T, D); keys `sequence`, `start`, optionally `split` (N,); optionally `columns` (D,) |
+| npy | samples (K, N, T, D), with the windows in the order of the evaluation; also npz without keys |
 | CSV | columns `sequence`, `start`, optionally `split`; `sample`, `ahead` from 1 to T; and a column for each of D |
 
 `start` is the first step of the window, which is observed. The npz files that `dvae forecast` writes are also read.

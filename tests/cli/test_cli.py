@@ -260,6 +260,17 @@ def test_forecasts_continue_the_observed_frames(capsys, run, tmp_path):
     assert "no clip 'nobody'" in failure(capsys, "forecast", str(run), "--out", str(out), "--clip", "nobody")
 
 
+def test_a_diffusion_of_all_frames_has_a_bound_and_no_forecasts(people, tmp_path, capsys):
+    run = str(tmp_path / "run")
+    equations = ["--generative", "p(x_{1:T})", "--inference", "", "--emission", "diffusion", "--width", "8"]
+    assert main(["fit", "equations", *equations, "--data", str(people), "--out", run, "--steps", "2", *SMALL[:2]]) == 0
+    assert f"the model has no forecasts; compare its bound with: dvae compare {run} --no-forecasts" in (
+        " ".join(capsys.readouterr().out.split())
+    )
+    assert "so the model cannot forecast" in failure(capsys, "evaluate", run)
+    assert main(["compare", run, "--no-forecasts", "--out", str(tmp_path / "bounds.json")]) == 0
+
+
 def test_custom_equations_are_fitted_and_loaded(people, tmp_path):
     out = tmp_path / "own"
     options = ["--latents", "z", "2", "--network", "dense", "--steps", "5", *SMALL]

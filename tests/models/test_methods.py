@@ -464,7 +464,7 @@ def test_entry_points_add_methods_but_cannot_replace_one(monkeypatch):
 
 
 def test_equations_of_all_steps_have_one_diffusion_and_forecast_only_with_context():
-    options = {"inference": "", "emission": "diffusion", "width": 16, "warm_up": 0}
+    options = {"inference": "", "emission": "diffusion", "width": 16}
     method = dvae.method("equations", generative="p( x_{1 :T} )", **options)
     assert method.build({"x": 2}).generator["x"].joint
     assert not dvae.method("equations", generative="p(x_t | x_{<t})", **options).build({"x": 2}).generator["x"].joint

@@ -106,6 +106,10 @@ def test_a_joint_prior_of_all_steps_replaces_independent_steps():
     levels, old_levels = (each.sample(500, length=6)["x"].mean((1, 2)) for each in (second, first))
     near, old_near = (((each.abs() - 2).abs() < 0.8).float().mean() for each in (levels, old_levels))
     assert near > 0.7 > 0.4 > old_near
+    assert first.can_forecast
+    assert not second.can_forecast
+    with pytest.raises(ValueError, match=r"all steps of z jointly, .* so the model cannot forecast"):
+        second.forecast(x[:2], 2)
 
 
 @pytest.mark.parametrize(
@@ -114,6 +118,9 @@ def test_a_joint_prior_of_all_steps_replaces_independent_steps():
         ({}, "got distributions of nothing"),
         ({"p(w)": Diffusion(), "p(w | u)": Diffusion()}, "expected factors of latents"),
         ({"p(w | u)": Diffusion()}, "sizes missing for u"),
+        ({"q(w | x_{1:T})": Diffusion()}, "expected factors of latents"),
+        ({"p(w) p(v)": Diffusion(), "p(w)": Diffusion()}, "expected factors of latents"),
+        ({"p(w)": Diffusion}, "is the class Diffusion"),
         ({"p(w_t)": Diffusion()}, r"got distributions of p\(w_t\); expected factors of latents, which are p\(w\)"),
         ({"p(x)": Flow()}, r"factors of latents, which are p\(w\)"),
         ({"p(w)": FlowMatching()}, "has a loss in place of a density"),

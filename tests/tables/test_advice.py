@@ -144,15 +144,19 @@ def test_columns_that_reveal_a_target_are_named():
 
 
 @pytest.mark.parametrize("role", ["target", "known", "past"])
-@pytest.mark.parametrize("decimals", [9, 0])
+@pytest.mark.parametrize("decimals", [9, 0, "plateaus"])
 def test_columns_that_contain_the_future_of_a_target_are_left_out(role, decimals):
-    x = (50 + 3 * noise(4, 300, 1)).round(decimals)
+    if decimals == "plateaus":  # forward-filled values
+        x, decimals = (50 + 3 * noise(4, 15, 1)).round(0).repeat(20, 1), 0
+    else:
+        x = (50 + 3 * noise(4, 300, 1)).round(decimals)
     columns = Column("x0", family="positive", rounding=10.0**-decimals), Column("lead", role)
     for shift in (1, 5):
         lead = np.concatenate([x[:, shift:], np.full((4, shift, 1), np.nan)], 1)
         (text,) = (each for each in found(np.concatenate([x, lead], 2), columns) if each.startswith("'lead'"))
         which = "one of them" if role == "target" else "it"
-        assert text == f"'lead' equals 'x0' {shift} steps later; leave {which} out (--columns)"
+        steps = "1 step" if shift == 1 else f"{shift} steps"
+        assert text == f"'lead' equals 'x0' {steps} later; leave {which} out (--columns)"
 
 
 def test_scales_and_levels_that_differ_are_named():

@@ -217,7 +217,7 @@ def convert(
 
     def clips(stage: Path) -> Iterator[Clip]:
         work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
-        here = Path.cwd()
+        here = None if jobs == 1 else Path.cwd()
         results = work(delayed(_convert_file)(reader, file, stage, format, skip_bad, here) for file in files)
         with closing(results), progress_bar(True) as bar:
             for file, result in bar.track(zip(files, results, strict=True), len(files), description="clips"):
@@ -258,13 +258,18 @@ def _split(split: str, source: Path, several: bool) -> str:
 
 def _name(source: Path) -> str:
     """Return the name of a folder, or of a file without its ending."""
-    return source.absolute().name if source.is_dir() else source.stem
+    return _absolute(source).name if source.is_dir() else source.stem
+
+
+def _absolute(path: Path) -> Path:
+    """Return the absolute path without `..`."""
+    return Path(os.path.abspath(path))
 
 
 def _renamed(motion: MotionSet, source: Path, sources: Sequence[Path], prefix: bool, archive: bool) -> MotionSet:
     """Return clips in the splits of `_files_of`, whose names may have a prefix."""
     unique = (archive or source.is_dir()) and [*map(_name, sources)].count(_name(source)) == 1
-    start = f"{_name(source) if unique else source.absolute().parent.name}-" * prefix
+    start = f"{_name(source) if unique else _absolute(source).parent.name}-" * prefix
     clips = [
         replace(clip, name=start + clip.name, split=_split(clip.split, source, len(sources) > 1)) for clip in motion
     ]
@@ -273,14 +278,15 @@ def _renamed(motion: MotionSet, source: Path, sources: Sequence[Path], prefix: b
 
 
 def _convert_file(
-    reader: FileReader, file: File, out: Path, format: str, skip_bad: bool, directory: Path
+    reader: FileReader, file: File, out: Path, format: str, skip_bad: bool, directory: Path | None
 ) -> tuple[Clip, Skeleton, list[str]] | str:
     """Read one file, and write its clip unless all clips go into one npz.
 
     Returns:
         Clip (its fullest frame if it was written), skeleton and notes; or the reason why the file cannot be used.
     """
-    os.chdir(directory)  # relative paths start there, and a process may be left from a call in another directory
+    if directory:  # where relative paths start; a process may be left from a call in another directory
+        os.chdir(directory)
     try:
         clip, skeleton, notes = reader(file)
         if format == "npz":

@@ -300,7 +300,7 @@ def test_bands_of_a_split_by_time_continue_over_the_test_windows(panel, tmp_path
     assert widths == sorted(widths)
     (_, name, _), count = test.keys[0], len(test) // 4
     end = test.origins[:, 1].max().item()
-    with pytest.raises(ValueError, match=rf"^{count} of {len(test)} windows start before the calibration futures of"):
+    with pytest.raises(ValueError, match=rf"^the futures of {count} of {len(test)} windows begin before the last"):
         replace(bands, data={**bands.data, "until": {name: end}}).coverage(model, test, progress=False)
     document = bands.document()
     del document["attributes"]["rate"]  # a file of an older version
