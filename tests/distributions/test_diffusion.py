@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from pyro import poutine
 from torch.distributions import MultivariateNormal
 
 import dvae
@@ -438,6 +439,31 @@ def test_per_step_emissions_forecast_and_impute():
         filled = model.impute({"x": x, "mask": mask}, samples=2)["x"]
         assert torch.equal(filled[:, mask], x[mask].expand(2, -1))
         assert (filled[0, :, 2] != filled[1, :, 2]).all()
+
+
+def test_motion_is_completed_along_paths_and_parts_are_controlled():
+    torch.manual_seed(0)
+    spec = {"denoiser": Denoiser(SelfAttention(16, 2)), "steps": 4}
+    path = torch.randn(600, 5, 1).cumsum(1)
+    x = torch.cat([path, -path], 2) + 0.1 * torch.randn(600, 5, 2)
+    options = {"steps": 100, "learning_rate": 5e-3, "decay": 0.5, "progress": False}
+    pair, sizes = ("p(x_{1:T} | y_{1:T})", ""), {"x": 2, "y": 1}
+    along = dvae.DynamicalVAE(*pair, sizes, distributions=Diffusion(**spec))
+    dvae.fit(along, {"x": x[:500], "y": path[:500]}, **options)
+    drawn = along.sample(length=5, batch={"y": path[500:]})["x"]
+    error, other = (drawn - x[500:]).square().mean(), (drawn - x[500:].roll(1, 0)).square().mean()
+    assert error < 0.2 * other
+    parts = dvae.DynamicalVAE(
+        "p(lower_{1:T}) p(upper_{1:T} | lower_{1:T})",
+        "",
+        {"lower": 1, "upper": 1},
+        observed=("lower", "upper"),
+        distributions=Diffusion(**spec),
+    )
+    dvae.fit(parts, {"lower": x[:500, :, :1], "upper": x[:500, :, 1:]}, **options)
+    lower = x[500:, :, :1]
+    upper = poutine.condition(parts.model, data={"lower": lower})({}, length=5, size=100)["upper"]
+    assert (upper + lower).square().mean() < 0.2 * (upper + lower.roll(1, 0)).square().mean()
 
 
 def test_guidance_moves_draws_away_from_the_unconditional_denoiser():
