@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,6 +28,7 @@ from ..distributions import (
     StudentT,
     Vamp,
 )
+from ..distributions.base import Shape, is_real
 from ..distributions.priors import VampModule
 from ..factorization.inversion import guide
 from ..factorization.notation import Factorization
@@ -172,6 +174,12 @@ class LikelihoodMethod(Method):
         model_arguments |= {"generative": generative, "inference": inference}
         if schema.emission is not None and self.emission is None:
             model_arguments["distributions"]["p(x)"] = self.of_columns(schema.emission)
+        elif schema.emission is not None and (replaced := columns_not_real(schema)):
+            real = ", ".join(f"{name} ({family})" for name, family in replaced.items())
+            warnings.warn(
+                f"emission={self.emission!r} treats {real} as real numbers; leave emission out for these families",
+                stacklevel=3,
+            )
         model = kind(**{"indicators": schema.indicators, **model_arguments}, view=view or schema.view)
         model.per = schema.per
         for name, coordinates in schema.units.items():
@@ -294,6 +302,15 @@ class LatentMethod(LikelihoodMethod):
         steps = self.warm_up if self.equations()[1].factors else None
         weight = SHAPES[self.warm_up_shape](0.0, 1.0, steps=steps) if steps else 1.0
         return Evidence(kl_weight=weight, free_bits=self.free_bits)
+
+
+def columns_not_real(schema: Any) -> dict[str, str]:
+    """Return the families, by name, of target columns that are not real numbers in the units of a table's schema."""
+    columns = [column for column in schema.columns.targets for _ in column.coordinates]
+    single = [(range(len(columns)), schema.emission)]
+    parts = schema.emission.parts if isinstance(schema.emission, Product) else single
+    places = [n for some, part in parts if not is_real(part.build(Shape(len(some), 1)).support) for n in some]
+    return {columns[place].name: columns[place].family for place in sorted(places)}
 
 
 def with_residual(distribution: Any, residual: float) -> Any:

@@ -31,8 +31,7 @@ from ...data.sequences import RandomGiven, interpolate_missing
 from ...data.series_units import GivenUnits, SeriesUnits
 from ...data.units import Coordinate
 from ...data.views import Given, View, Views
-from ...distributions import Diffusion, DistributionSpec, Product
-from ...distributions.base import Shape, is_real
+from ...distributions import Diffusion, DistributionSpec
 from ...factorization.notation import Factorization
 from ...factorization.relations import ALL
 from ...inference.training.options import Training
@@ -42,7 +41,7 @@ from ...networks.base import FixedLengthNetwork, aligned
 from ...options import Count, Layers, Range, Size
 from ...program.batch import AnyBatch
 from ...program.model import DynamicalVAE
-from ..method import LikelihoodMethod
+from ..method import LikelihoodMethod, columns_not_real
 
 CONTEXT = "g"
 LOGARITHMS = ("positive", "log-normal")
@@ -210,15 +209,11 @@ def _check_columns(schema: Any) -> None:
     """
     if schema.emission is None:
         return
-    single = [(range(schema.size(WHOLE)), schema.emission)]
-    for places, part in schema.emission.parts if isinstance(schema.emission, Product) else single:
-        if not is_real(part.build(Shape(len(places), 1)).support):
-            columns = [column for column in schema.columns.targets for _ in column.coordinates]
-            column = columns[places[0]]
-            raise SchemaError(
-                f"csdi draws real numbers, but column {column.name!r} has the family {column.family!r}; give it the "
-                "family real, or take a method for any family, such as srnn"
-            )
+    for name, family in columns_not_real(schema).items():
+        raise SchemaError(
+            f"csdi draws real numbers, but column {name!r} has the family {family!r}; give it the family real, or take "
+            "a method for any family, such as srnn"
+        )
     if schema.columns.lags:
         raise SchemaError(
             "csdi hides entries at random, but lags repeat them at later steps; leave lags out (csdi reads all given "

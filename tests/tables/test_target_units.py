@@ -89,6 +89,15 @@ def test_priors_come_from_training_sequences_and_survive_the_configuration(data)
             PanelSchema.from_data(rain, Cut(4, 3)).in_units(units)
 
 
+def test_an_emission_that_replaces_families_is_warned_of(data):
+    with pytest.warns(UserWarning, match=r"'normal' treats riders \(overdispersed\), price \(log-normal\), open"):
+        dvae.method("vae", emission="normal").build(data)
+    with pytest.warns(UserWarning, match=r"riders \(overdispersed\), open \(binary\) as real"):  # logs of prices are
+        dvae.method("vae", emission="normal", units="logs").build(data)
+    real = PanelData.of([np.random.default_rng(0).normal(size=(20, 2))] * 3, cut=Cut(4, 3))
+    dvae.method("vae", emission="normal").build(real)
+
+
 def test_levels_of_counts_use_earlier_observed_steps_alone(data):
     windows = data.windows("train")
     batch = windows.all()
