@@ -177,7 +177,7 @@ class LikelihoodMethod(Method):
         elif schema.emission is not None and (replaced := columns_not_real(schema)):
             real = ", ".join(f"{name} ({family})" for name, family in replaced.items())
             warnings.warn(
-                f"emission={self.emission!r} treats {real} as real numbers; leave emission out for these families",
+                f"emission={self.emission!r} treats {real} as real numbers; leave emission out to keep the families",
                 stacklevel=3,
             )
         model = kind(**{"indicators": schema.indicators, **model_arguments}, view=view or schema.view)
@@ -327,7 +327,7 @@ def with_residual(distribution: Any, residual: float) -> Any:
         family = next((name for name, spec in FAMILIES.items() if spec == distribution), kind)
         raise ValueError(
             f"residual is {residual}, but the family {family!r} has no location to which the previous value can be "
-            "added; leave residual at 0, take the family real for these columns, or for positive ones the units changes"
+            "added. Leave residual at 0, or give these columns the family real, or positive ones the units changes"
         )
     return replace(distribution, residual=residual)
 

@@ -96,15 +96,13 @@ def hidden_by(sequences: list[str], hidden: Tensor) -> dict[str, int]:
 
 def interpolated(name: str, part: str) -> Tensor:
     """Return draws (S, N, T, D) of interpolation in time, plus errors of the same column in training windows."""
-    truth, mask, hidden, _ = truth_of(name, "train")
-    errors, known = truth - interpolate_missing(truth, mask), hidden
+    train, train_mask, hidden, _ = truth_of(name, "train")
+    errors = train - interpolate_missing(train, train_mask)
     truth, mask, *_ = truth_of(name, part)
-    generator, draws = (
-        torch.Generator().manual_seed(HIDING_SEED),
-        interpolate_missing(truth, mask).repeat(DRAWS, 1, 1, 1),
-    )
+    draws = interpolate_missing(truth, mask).repeat(DRAWS, 1, 1, 1)
+    generator = torch.Generator().manual_seed(HIDING_SEED)
     for column in range(truth.shape[-1]):
-        values = errors[..., column][known[..., column]]
+        values = errors[..., column][hidden[..., column]]
         draws[..., column] += values[torch.randint(len(values), draws.shape[:-1], generator=generator)]
     return draws
 
