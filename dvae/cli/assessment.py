@@ -30,10 +30,11 @@ from ..motion.scoring.by_action import action_windows, errors_by_action
 from ..motion.scoring.published import Paper, Root, Unit
 from ..runs import directory as runs
 from . import loading
-from .console import ERROR, OUT, Failed, Missing, UsageError, arguments, at_least, check_files, note, save_figure
+from .console import ERROR, OUT, Missing, UsageError, arguments, at_least, check_files, note, save_figure
 from .fitting import CutOptions, DataOptions, ProtocolName
 from .futures import joint_names
 from .help import Expert
+from .loading import ON_CPU, Device, Use
 
 MOST_REMEMBERED = 2**32
 """Maximum size in bytes of the training windows that references load; memory-mapped data may be larger."""
@@ -165,7 +166,7 @@ def evaluate(
     data: str | None = None,
     measure: Literal["forecasts", "quality", "angles", "codes"] = "forecasts",
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
     samples: int = 50,
     bound_particles: int = 0,
     log_score_particles: Expert[int] = 0,
@@ -176,6 +177,7 @@ def evaluate(
     ensembles: bool = False,
     seed: int = 0,
     batch_size: Expert[int] = 32,
+    cuda_graph: Expert[bool] = False,
     out: Path | None = None,
     figure: Path | None = None,
 ) -> None:
@@ -210,6 +212,7 @@ def evaluate(
         ensembles: add a row for the equal-weight mixture of runs that differ only in their seed.
         seed: seed of the draws.
         batch_size: number of windows forecast at once.
+        cuda_graph: with --accelerator cuda, replay forecasts as CUDA graphs.
         out: file to write instead of evaluation.json in each run.
         figure: save the scores as dots with error bars, or as box plots for segments.
     """
@@ -224,16 +227,16 @@ def evaluate(
         raise UsageError("--forecasts is for scores of forecasts, not for another --measure or for segments")
     if run and (external.protocol or external.root or source != AS_STORED):
         raise UsageError("the runs define the windows; leave --protocol, --root and options for reading the data out")
-    options = samples, log_score_particles, pose_prior, classifier, control, missing, failed
-    scoring = ForecastScoring(*options, several_futures, windows_of, ensembles)
+    options = samples, log_score_particles, pose_prior, classifier, control, missing, use
+    scoring = ForecastScoring(*options, several_futures, windows_of, ensembles, cuda_graph)
     chosen = [name for name, options in (("angles", angles), ("quality", realism)) if options != type(options)()]
     if wrong := next((name for name in chosen if name != measure), None):
         raise UsageError(f"options of --measure {wrong} do not apply to --measure {measure}; leave them out")
     if measure != "forecasts":
-        if bound_particles or scoring != replace(ForecastScoring(samples), missing=missing, failed=failed):
+        if bound_particles or scoring != replace(ForecastScoring(samples), missing=missing, use=use):
             raise UsageError(
                 f"--bound-particles, --log-score-particles, --pose-prior, --classifier, --joints, --exchange, "
-                f"--temperature and --several-futures do not apply to --measure {measure}; leave them out"
+                f"--temperature, --several-futures and --cuda-graph do not apply to --measure {measure}; leave them out"
             )
         if measure == "quality" and samples != ForecastScoring.samples:
             raise UsageError("--samples does not apply to --measure quality, which draws one future; leave it out")
@@ -284,10 +287,11 @@ class ForecastScoring:
     classifier: tuple[Path, ...] = ()
     control: Control = Control()
     missing: bool = False
-    failed: bool = False
+    use: Use = ON_CPU
     several_futures: bool = False
     windows_of: Paper | None = None
     ensembles: bool = False
+    cuda_graph: bool = False
 
 
 def _forecasts(
@@ -301,7 +305,7 @@ def _forecasts(
     """Score forecasts of test windows; return the scores and the name of their file."""
     loaded: list[runs.Loaded] = []
     if paths or not external.forecasts:
-        loaded = loading.with_equal_windows(paths, data, failed=scoring.failed)
+        loaded = loading.with_equal_windows(paths, data, use=scoring.use)
         data_set = loading.data_of(data, *loaded, missing=scoring.missing)
         windows = loading.windows_to_test(loaded[0], data_set, whole_sequences=False)
     elif data is None or scoring.classifier:
@@ -338,6 +342,7 @@ def _forecasts(
         scores=scores,
         samples=scoring.samples,
         log_score_particles=scoring.log_score_particles,
+        cuda_graph=scoring.cuda_graph,
         training_windows=_reference_windows(data_set) if is_known else None,
         configs={name: Run(run.path).config for name, run in zip(loading.names(loaded), loaded, strict=True)},
         options={} if temperature is None else {"temperature": temperature},
@@ -375,7 +380,7 @@ def _measure(
     """Measure the quality, the Euler angles or the codes of runs on motion; print and write the result."""
     if (kind := loading.kind_of(paths, data)) != "motion":
         raise UsageError(f"--measure {measure} is for forecasts of motion, and {paths[0]} was fitted on {kind}")
-    loaded = loading.with_equal_windows(paths, data, ("motion",), scoring.failed)
+    loaded = loading.with_equal_windows(paths, data, ("motion",), scoring.use)
     data_set = loading.data_of(data, *loaded, missing=scoring.missing)
     models = {name: run.model for name, run in zip(loading.names(loaded), loaded, strict=True)}
     windows: Any = loading.windows_to_test(loaded[0], data_set, whole_sequences=False)
@@ -441,14 +446,14 @@ def _reference_windows(data_set: Any) -> Any:
 def _segments(paths: Sequence[Path], data: str | None, scoring: ForecastScoring, **settings: Any) -> tuple[Any, str]:
     """Score the reconstruction of test segments; return the scores and the name of their file."""
     if inapplicable := [
-        name for name, value in vars(scoring).items() if name != "failed" and value != getattr(ForecastScoring, name)
+        name for name, value in vars(scoring).items() if name != "use" and value != getattr(ForecastScoring, name)
     ]:
         option = inapplicable[0]
         options = "--joints, --exchange and --temperature are" if option == "control" else f"--{option} is"
         raise UsageError(
             f"{options.replace('_', '-')} for forecasts, but {paths[0]} generates whole segments; leave them out"
         )
-    loaded = loading.with_equal_windows(paths, data, ("segments",), scoring.failed)
+    loaded = loading.with_equal_windows(paths, data, ("segments",), scoring.use)
     data_set = loading.data_of(data, *loaded)
     by_name = dict(zip(loading.names(loaded), loaded, strict=True))
     try:
@@ -495,6 +500,7 @@ def compare(
     stride: Expert[int | None] = None,
     seed: int = 0,
     batch_size: Expert[int] = 32,
+    accelerator: Expert[Device] = "cpu",
     out: Path | None = None,
     figure: Path | None = None,
 ) -> None:
@@ -521,6 +527,7 @@ def compare(
         stride: frames between the starts of test windows, in place of the protocol's; a larger stride is faster.
         seed: seed of the draws.
         batch_size: number of windows scored at once.
+        accelerator: device that computes; cuda is a GPU.
         out: JSON file for the comparison.
         figure: save bounds, differences, k-hat, and KL over time.
     """
@@ -529,7 +536,7 @@ def compare(
     at_least(1, particles=particles, estimates=estimates, samples=samples, batch_size=batch_size, stride=stride)
     at_least(0, contrasts=contrasts, filter_particles=filter_particles)
     check_files(out, figure, ".json")
-    loaded = loading.with_equal_windows(run, data, failed=True)
+    loaded = loading.with_equal_windows(run, data, use=Use(failed=True, accelerator=accelerator))
     data_set = loading.data_of(data, *loaded, missing=missing)
     if unfinished := [str(each.path) for each in loaded if each.unfinished]:
         raise ValueError(
@@ -566,7 +573,7 @@ def _pose_prior(scoring: ForecastScoring, data: str | None, skeleton: motion.Ske
     """
     if (path := scoring.pose_prior) is None:
         return None
-    model = loading.load(path, data, scoring.failed).model
+    model = loading.load(path, data, scoring.use).model
     if not isinstance(model, PosePriorModel) or model.skeleton != skeleton:
         raise UsageError(f"--pose-prior {path} is not a run of a pose-prior for the skeleton {skeleton.name!r}")
     return model
@@ -580,7 +587,7 @@ def _classifiers(scoring: ForecastScoring, data: str | None, scored_run: runs.Lo
     """
     classifiers: dict[str, Any] = {}
     for path in scoring.classifier:
-        loaded = loading.load(path, data, scoring.failed)
+        loaded = loading.load(path, data, scoring.use)
         if loaded.method.name != "action-classifier":
             raise UsageError(f"--classifier {path} is a fitted {loaded.method.name}, not an action-classifier")
         if loaded.model.label in classifiers:

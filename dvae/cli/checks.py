@@ -29,7 +29,6 @@ from . import loading, tables
 from .assessment import save_and_print
 from .console import (
     ERROR,
-    Failed,
     Missing,
     UsageError,
     arguments,
@@ -39,6 +38,7 @@ from .console import (
 )
 from .fitting import DataOptions, MethodOptions, SweepOptions, given_options, options_of
 from .help import Expert
+from .loading import ON_CPU, Use
 
 if TYPE_CHECKING:
     EquationOptions = Any
@@ -51,7 +51,7 @@ def calibration(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
     simulations: int = 200,
     draws: Expert[int] = 99,
     ranked_steps: Expert[int] = 4,
@@ -83,7 +83,7 @@ def calibration(
     at_least(1, simulations=simulations, draws=draws, ranked_steps=ranked_steps, batch_size=batch_size)
     at_least(19, samples=samples)
     check_files(out, figure, ".json")
-    loaded, data_set = loading.forecaster(run, data, missing, failed)
+    loaded, data_set = loading.forecaster(run, data, missing, use)
     model, windows = loaded.model, loading.windows_to_test(loaded, data_set, whole_sequences=False)
     steps = np.unique(np.linspace(1, windows.length, ranked_steps + 1)[1:].round().astype(int)).tolist()
     document: dict[str, Any] = {}
@@ -112,7 +112,7 @@ def posterior(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
     windows: int = 3,
     frames: int | None = None,
     draws: int = 1000,
@@ -146,7 +146,7 @@ def posterior(
     at_least(2, chains=chains, stein_draws=stein_draws)
     at_least(4, draws=draws)
     check_files(out, figure, ".json")
-    loaded, data_set = loading.forecaster(run, data, missing, failed)
+    loaded, data_set = loading.forecaster(run, data, missing, use)
     batch = data_set.windows("test").all()
     indices = np.unique(np.linspace(0, len(batch["x"]) - 1, windows).round().astype(int))
     selected = batch.map(lambda value: value[indices, :frames] if value.dim() == 3 else value[indices])
@@ -173,7 +173,7 @@ def gap(
     run: Annotated[Path, tyro.conf.Positional],
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
     count: int = 32,
     particles: int = 64,
     temperatures: int = 50,
@@ -208,7 +208,7 @@ def gap(
     at_least(1, count=count, particles=particles, temperatures=temperatures, chains=chains, batch_size=batch_size)
     at_least(0, fitting=fitting, reach=reach)
     check_files(out, figure, ".json")
-    loaded, data_set = loading.forecaster(run, data, missing, failed)
+    loaded, data_set = loading.forecaster(run, data, missing, use)
     result = bracket(
         loaded.model,
         loading.windows_to_test(loaded, data_set),
@@ -228,7 +228,7 @@ def coverage(
     run: Annotated[tuple[Path, ...], tyro.conf.Positional],
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
     level: float = 0.9,
     label: str | None = None,
     values: tuple[str, ...] = (),
@@ -264,7 +264,7 @@ def coverage(
         raise UsageError("--label and --values select the test clips for calibration; give both")
     if not run:
         raise UsageError("give at least one run directory")
-    loaded_runs = [loading.forecaster(each, data, missing, failed) for each in run]
+    loaded_runs = [loading.forecaster(each, data, missing, use) for each in run]
     loaded, data_set = min(loaded_runs, key=lambda pair: _test_steps(pair[0]))
     if len(loaded_runs) > 1:
         calibration_models, calibration_windows = _between_cutoffs(loaded_runs, label)

@@ -30,12 +30,6 @@ Missing = Annotated[
 ]
 """Option of every command that reads motion."""
 
-Failed = Annotated[
-    bool,
-    tyro.conf.arg(help="use the current weights of a run that failed or has made no step"),
-]
-"""Option of every command that uses runs."""
-
 
 def is_first_process() -> bool:
     """Return whether this is the only or the first process of a run, without importing torch."""

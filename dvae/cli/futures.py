@@ -22,9 +22,9 @@ from ..motion.files.writing import format_of
 from ..options import nearest
 from ..runs import directory as runs
 from . import tables
-from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, save_figure
+from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, save_figure
 from .help import Expert
-from .loading import data_of, forecaster, kind_of, load_run
+from .loading import ON_CPU, Use, data_of, forecaster, kind_of, load_run
 from .segments import Recovery
 
 SAMPLES = 10
@@ -67,7 +67,7 @@ def forecast(
     seed: int = 0,
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
     figure: Path | None = None,
     beyond: bool = False,
     blend: int = 0,
@@ -110,7 +110,7 @@ def forecast(
     at_least(1, samples=samples, horizon=horizon)
     at_least(0, window=along.window)
     check_files(out, figure)
-    loaded, data_set = forecaster(run, data, missing, failed)
+    loaded, data_set = forecaster(run, data, missing, use)
     if loaded.config.kind == "panel":
         of_motion = {"fix": bool(fix), "missing": missing, "draw-emission": draw_emission is not None}
         of_motion["blend"] = blend > 0
@@ -225,7 +225,7 @@ def impute(
     seed: int = 0,
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
 ) -> None:
     """Draw missing values: joints of motion, entries of a table, or whole segments from parts of them.
 
@@ -265,11 +265,11 @@ def impute(
     if kind == "segments":
         if inapplicable or particles > 1 or missing:
             raise UsageError(f"--{[*inapplicable, 'particles' if particles > 1 else 'missing'][0]} is not for segments")
-        recovery.run(run, out, 5 if samples is None else samples, seed, data, failed)
+        recovery.run(run, out, 5 if samples is None else samples, seed, data, use)
         return
     if recovery != Recovery():
         raise UsageError(f"--from, --file and --seen are for runs of motion-latent, and {run} is not one")
-    loaded, data_set = forecaster(run, data, missing, failed)
+    loaded, data_set = forecaster(run, data, missing, use)
     if kind == "panel":
         if out is None or inapplicable:
             raise UsageError("for a table, impute writes draws to --out FILE.csv, .parquet or .npz")
@@ -315,7 +315,7 @@ def _fillings(model: Any, windows: motion.Windows, samples: int, seed: int, is_d
     with seeded(seed):
         for indices in torch.arange(len(windows)).split(64):
             values = model.impute(batch.rows(indices), samples, draw=is_drawn)["x"]
-            parts.append(windows.positions(values).numpy())
+            parts.append(windows.positions(values.cpu()).numpy())
     observed = windows.skeleton.with_root(batch.mask().unflatten(-1, (-1, 3)), True)[..., 0].numpy()
     emission = "drawn" if is_drawn else "mean"
     return motion.Imputed(windows.skeleton, windows.keys, np.concatenate(parts, 1), observed, emission)
@@ -345,7 +345,7 @@ def animate(
     seed: int = 0,
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
     every: Expert[int | None] = None,
     figure: Path | None = None,
 ) -> None:
@@ -375,7 +375,7 @@ def animate(
             raise ValueError(
                 f"{source} is a folder but not a run directory; name a run, or a motion file such as {source}/FILE.bvh"
             )
-        loaded = load_run(Path(source), data, failed=failed)
+        loaded = load_run(Path(source), data, use=use)
         windows = windows_of(data_of(data, loaded, missing=missing), clip)
         index = _fastest_window(windows.positions(windows.all().mask_to_nan()).numpy(), window)
         futures = draw_futures(loaded, windows, [index], samples or 5, seed, fix=fix)
@@ -493,7 +493,7 @@ def draw_futures(
             shared = model.forecast(past_part, n_frames, 1, draw_emission=is_drawn) if fix else {}
             fixed = {"fix": {name: shared[name][0] for name in fix}} if fix else {}
             values = model.forecast(past_part, n_frames, samples, draw_emission=is_drawn, **fixed)["x"][:, :, :horizon]
-            parts.append(windows.positions(values).numpy())
+            parts.append(windows.positions(values.cpu()).numpy())
             del values  # with many samples, the largest object here
     observed_frames, truth = (windows.positions(x).numpy() for x in (past.mask_to_nan(), future))
     forecasts, emission = np.concatenate(parts, axis=1), "drawn" if is_drawn else "mean"

@@ -7,9 +7,11 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import torch
 
 from .. import motion
 from ..data.views import View
@@ -22,6 +24,7 @@ from ..runs import directory as runs
 from ..tables.forecasts import panel_scores
 from . import tables
 from .console import UsageError, note
+from .help import Expert
 
 USES = {
     "motion": "forecasts and has no segments; use dvae forecast, animate, evaluate, compare or check",
@@ -33,17 +36,34 @@ FORECASTING = ("motion", "panel")
 """Kinds of data with forecasts."""
 SCORES: Mapping[str, Scores] = {"motion": motion.scores, "panel": panel_scores}
 """Scores of forecasts, by kind of data."""
+Device = Literal["cpu", "cuda", "mps"]
 
 
-def load_run(path: Path, data: str | None, kinds: Collection[str] = ("motion",), failed: bool = False) -> runs.Loaded:
+@dataclass(frozen=True)
+class Use:
+    """Options of every command that uses runs.
+
+    Args:
+        failed: use the current weights of a run that failed or has made no step.
+        accelerator: device that computes; cuda is a GPU.
+    """
+
+    failed: Expert[bool] = False
+    accelerator: Expert[Device] = "cpu"
+
+
+ON_CPU = Use()
+
+
+def load_run(path: Path, data: str | None, kinds: Collection[str] = ("motion",), use: Use = ON_CPU) -> runs.Loaded:
     """Load a run that was fitted on data of one of the given kinds.
 
     Raises:
-        ValueError: the run was fitted on another kind, or it failed and `failed` is False.
+        ValueError: the run was fitted on another kind, or it failed and `use.failed` is False.
     """
-    loaded = load(path, data, failed)
-    if loaded.config.kind not in kinds and (use := USES.get(loaded.config.kind)):
-        raise ValueError(f"{path} is a fitted {loaded.method.name}, which {use}")
+    loaded = load(path, data, use)
+    if loaded.config.kind not in kinds and (others := USES.get(loaded.config.kind)):
+        raise ValueError(f"{path} is a fitted {loaded.method.name}, which {others}")
     if loaded.method.name in metric_models():
         raise ValueError(
             f"{path} is a fitted {loaded.method.name}, which has no forecasts; its bounds are in {path / 'log.jsonl'}"
@@ -51,19 +71,24 @@ def load_run(path: Path, data: str | None, kinds: Collection[str] = ("motion",),
     return loaded
 
 
-def load(path: Path, data: str | None, failed: bool = False) -> runs.Loaded:
-    """Load a run of any kind, with a note if it has not finished.
+def load(path: Path, data: str | None, use: Use = ON_CPU) -> runs.Loaded:
+    """Load a run of any kind on a device, with a note if it has not finished.
 
     Raises:
-        ValueError: `failed` is False, and the run failed or has no optimiser step yet.
+        ValueError: `use.failed` is False, and the run failed or has no optimiser step yet.
+        UsageError: torch has no such device.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the note below covers more cases than the warning of `runs.load`
         loaded = runs.load(path, data)
-    if loaded.failed and not failed:
+    if loaded.failed and not use.failed:
         raise ValueError(f"{loaded.unfinished}; or use its current weights with --failed")
     if loaded.unfinished:
         note(loaded.unfinished)
+    if use.accelerator != "cpu":
+        if not getattr(torch, use.accelerator).is_available():
+            raise UsageError(f"--accelerator {use.accelerator}: torch finds no such device; leave the option out")
+        loaded.model.to(use.accelerator)
     return loaded
 
 
@@ -127,14 +152,14 @@ def windows_to_test(run: runs.Loaded, data_set: Any, stride: int | None = None, 
     return motion.windows(data_set.motion, protocol, "test")
 
 
-def forecaster(path: Path, data: str | None, missing: bool = False, failed: bool = False) -> tuple[runs.Loaded, Any]:
+def forecaster(path: Path, data: str | None, missing: bool = False, use: Use = ON_CPU) -> tuple[runs.Loaded, Any]:
     """Load a run that forecasts, and its data or other data, as in `load_run` and `data_of`."""
-    loaded = load_run(path, data, FORECASTING, failed)
+    loaded = load_run(path, data, FORECASTING, use)
     return loaded, data_of(data, loaded, missing=missing)
 
 
 def with_equal_windows(
-    paths: Sequence[Path], path: str | None, kinds: Collection[str] = FORECASTING, failed: bool = False
+    paths: Sequence[Path], path: str | None, kinds: Collection[str] = FORECASTING, use: Use = ON_CPU
 ) -> list[runs.Loaded]:
     """Load runs that have the same test windows, in the data they were fitted on or in the data at `path`.
 
@@ -147,7 +172,7 @@ def with_equal_windows(
     path_repeated, count = Counter(map(str, paths)).most_common(1)[0]
     if count > 1:
         raise UsageError(f"a run is named twice: {path_repeated}; name it once")
-    loaded = [load_run(each, path, kinds, failed) for each in paths]
+    loaded = [load_run(each, path, kinds, use) for each in paths]
     first = loaded[0]
     for other in loaded[1:]:
         if not (other.alike(first) if path is None else other.schema.windows == first.schema.windows):

@@ -22,8 +22,9 @@ from ..tables.windows import PanelWindows
 from . import loading
 from .assessment import Control
 from .assessment import evaluate as evaluate_runs
-from .console import ERROR, Failed, Missing, UsageError, at_least, check_files
+from .console import ERROR, Missing, UsageError, at_least, check_files
 from .futures import draw_futures
+from .loading import ON_CPU, Use
 
 OF_DIRECTORIES = (
     sections.overview,
@@ -55,7 +56,7 @@ def report(
     edges: Path | None = None,
     data: str | None = None,
     missing: Missing = False,
-    failed: Failed = False,
+    use: Use = ON_CPU,
 ) -> None:
     """Write all results of some runs to one page: equations, graphs, curves, scores, bounds, latents and futures.
 
@@ -78,10 +79,10 @@ def report(
     at_least(1, samples=samples, bound_windows=bound_windows, particles=particles)
     check_files(out, None, ".html", ".htm")
     ablation = None if edges is None else _ablation(edges)
-    loaded = loading.with_equal_windows(run, data, failed=failed)
+    loaded = loading.with_equal_windows(run, data, use=use)
     of_table = loaded[0].config.kind == "panel"
     if evaluate:
-        evaluate_runs(run, Control(), data=data, missing=missing, failed=failed, seed=seed)
+        evaluate_runs(run, Control(), data=data, missing=missing, use=use, seed=seed)
     by_name = dict(zip(loading.names(loaded), loaded, strict=True))
 
     with progress_bar(True) as bar:

@@ -36,8 +36,9 @@ from ..motion.segments.recovery import recover as recover_segments
 from ..options import Positive, Range, check
 from ..runs import directory as runs
 from . import loading
-from .console import ERROR, OUT, Failed, Missing, UsageError, at_least, check_files, note
+from .console import ERROR, OUT, Missing, UsageError, at_least, check_files, note
 from .help import Expert
+from .loading import ON_CPU, Use
 
 MOST_DRAWS = 100
 
@@ -139,7 +140,7 @@ class Recovery:
     aggregate: Expert[bool] = True
     two_way: Expert[bool] = False
 
-    def run(self, run: Path, out: Path | None, draws: int, seed: int, data: str | None, failed: bool) -> None:
+    def run(self, run: Path, out: Path | None, draws: int, seed: int, data: str | None, use: Use) -> None:
         """Recover segments, print the estimates with their uncertainty, and write them."""
         if draws > MOST_DRAWS:
             raise UsageError(f"--samples is {draws}; it must be at most {MOST_DRAWS}")
@@ -148,7 +149,7 @@ class Recovery:
             raise UsageError("give observations: --from NAME --seen KIND for segments of the run, or --file")
         if self.file is not None and self.glimpse != Glimpse():
             raise UsageError("--file contains all observations; --seen and its options are for segments in --from")
-        loaded = loading.load_run(run, data, ("segments",), failed)
+        loaded = loading.load_run(run, data, ("segments",), use)
         model, truth, takes = loaded.model, None, set()
         if self.file is None:
             data_set = loading.data_of(data, loaded)
@@ -191,7 +192,7 @@ def generate(
     seed: int = 0,
     data: str | None = None,
     missing: Expert[Missing] = False,
-    failed: Expert[Failed] = False,
+    use: Use = ON_CPU,
 ) -> None:
     """Draw segments of motion from N(0, I), the prior of a run of motion-latent, and compare them with real ones.
 
@@ -212,7 +213,7 @@ def generate(
     """
     at_least(2, samples=samples)
     check_files(out, None, ".npz", ".html", ".htm", "")
-    loaded = loading.load_run(run, data, ("segments",), failed)
+    loaded = loading.load_run(run, data, ("segments",), use)
     model, data_set = loaded.model, loading.data_of(data, loaded, missing=missing)
     known, test = data_set.windows("train"), data_set.windows("test")
     parts = {"known": known.all(), "real": test.all()}

@@ -59,17 +59,17 @@ class Reader:
     grouped: tuple[str, ...]
 
     def read(
-        self, batch: AnyBatch | None, dtype: torch.dtype, means: Mapping[str, Tensor], wide: Collection[str] = ()
+        self, batch: AnyBatch | None, parameter: Tensor, means: Mapping[str, Tensor], wide: Collection[str] = ()
     ) -> Batch:
-        """Return the batch as a dictionary of tensors, in this precision and in the model's representation.
+        """Return the batch as tensors, in the model's precision and representation and on its device.
 
         Reading the result again does not change it.
 
         Args:
             batch: as in `DynamicalVAE.model`.
-            dtype: precision of floating-point values.
+            parameter: parameter of the model, with its precision and device.
             means: dictionary from variable name to the values (D,) of missing entries; 0 for other variables.
-            wide: names of variables that are read in float64 whatever the dtype.
+            wide: names of variables that are read in float64 in any model.
 
         Raises:
             TypeError: if the batch is a table, or windows.
@@ -96,7 +96,8 @@ class Reader:
         exact = (
             {*wide, whole_name, *self.view.names} if wide or self.view.exact else set()
         )  # the view computes the variables from these
-        values = _tensors(Batch(batch), dtype, names, exact)
+        dtype = parameter.dtype
+        values = _tensors(Batch(batch), parameter, names, exact)
         if "mask" in values:
             values["mask"] = values.masks(whole_name)
             for name, mask in values.masks().items():
@@ -302,27 +303,27 @@ def _lengths_message(lengths: Tensor, length: int) -> str:
     return f"lengths must be (B,) whole numbers between 1 and {length}, got {lengths.tolist()}"
 
 
-def _tensors(batch: Batch, dtype: torch.dtype, names: Collection[str], wide: Collection[str]) -> Batch:
-    """Return the entries of a batch as tensors in the precision of the model.
+def _tensors(batch: Batch, parameter: Tensor, names: Collection[str], wide: Collection[str]) -> Batch:
+    """Return the entries of a batch as tensors in the precision of the model and on its device.
 
-    Floating-point entries and entries in `names` get the dtype, or float64 if they are in `wide`. Masks and counts,
+    Floating-point entries and entries in `names` get the precision, or float64 if they are in `wide`. Masks and counts,
     such as lengths, keep their type.
 
     Args:
         batch: arrays or tensors by name.
-        dtype: precision of the model.
+        parameter: parameter of the model.
         names: names of the variables.
         wide: names of the variables that are read in float64.
     """
     tensors = Batch()
     for name, value in batch.items():
         if isinstance(value, Mapping):
-            tensors[name] = _tensors(Batch(value), dtype, names if name == "view_inputs" else (), ())
+            tensors[name] = _tensors(Batch(value), parameter, names if name == "view_inputs" else (), ())
             continue
         tensor = tensor_of(value)
         if tensor.is_floating_point() or name in names:
-            tensor = tensor.double() if name in wide else _cast(name, tensor, dtype, batch)
-        tensors[name] = tensor
+            tensor = tensor.double() if name in wide else _cast(name, tensor, parameter.dtype, batch)
+        tensors[name] = tensor.to(parameter.device)
     return tensors
 
 

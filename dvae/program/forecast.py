@@ -252,7 +252,8 @@ def impute(
         value = draws[name]
         n_context = mask.shape[1] - value.shape[2]  # leading frames, which the model reads as context
         value = torch.cat([value[:, :, :1].expand(-1, -1, n_context, -1), value], 2)
-        filled[name] = torch.where(torch.as_tensor(mask), torch.as_tensor(values[name]).to(value), value)
+        observed, given = torch.as_tensor(mask).to(value.device), torch.as_tensor(values[name]).to(value)
+        filled[name] = torch.where(observed, given, value)
     return filled
 
 

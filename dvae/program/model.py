@@ -795,7 +795,7 @@ class DynamicalVAE(nn.Module):
             yield
 
     def read(self, batch: AnyBatch | None, *, size: int = 1, curriculum: float = 1.0, precise: bool = False) -> Batch:
-        """Return a batch as a dictionary, in the model's precision and representation, with missing entries filled in.
+        """Return a batch in the model's precision and representation, on its device, with missing entries filled in.
 
         A batch that was read before is returned unchanged. Shared variables are drawn if the batch does not give them,
         at a Pyro site outside the plate. Model and guide use the same draw, which therefore adds nothing to a bound. A
@@ -817,13 +817,13 @@ class DynamicalVAE(nn.Module):
                 "the model's parameters are on the meta device and have no values; build the model outside of "
                 "`torch.device('meta')`, or call `to_empty(device='cpu')` and load weights"
             )
-        reader = self.reader, parameter.dtype
+        reader = self.reader, parameter.dtype, parameter.device
         if isinstance(batch, Batch) and batch.reader == reader and not precise:
             return batch
         means = {name: units.filling for name, units in self.units.items()}
         # guide and model both read the batch
         wide = {name for name in self.units if name in self.wide or (precise and _is_wide(batch, name))}
-        data = Batch(memoize(self, [batch], lambda: self.reader.read(batch, reader[1], means, wide)))
+        data = Batch(memoize(self, [batch], lambda: self.reader.read(batch, parameter, means, wide)))
         one = {name: data.pop(name) for name in self.shared if name in data and data[name].dim() == 1}
         size = next((len(value) for value in data.values() if isinstance(value, Tensor)), size)
         for name, spec in self.shared.items():

@@ -360,10 +360,10 @@ def move(module: nn.Module) -> nn.Module:
     copies: dict[int, Any] = {}
     for part in module.modules():
         for name, value in part._parameters.items():
-            if value is not None:
+            if value is not None and not isinstance(value, OnDevice):
                 parameter = copies.setdefault(id(value), nn.Parameter(OnDevice(value.detach()), value.requires_grad))
                 setattr(part, name, parameter)
         for name, buffer in part._buffers.items():
-            if buffer is not None:
+            if buffer is not None and not isinstance(buffer, OnDevice):
                 part._buffers[name] = copies.setdefault(id(buffer), OnDevice(buffer))
     return module

@@ -165,7 +165,7 @@ class Inferred:
     def whole(self, values: Tensor) -> Tensor:
         """Return values (..., P) as (..., Q), with NaN at padding."""
         result = values.new_full((*values.shape[:-1], len(self.valid)), math.nan)
-        result[..., self.valid] = values
+        result[..., self.valid.to(values.device)] = values
         return result
 
     def _of_guide(self, n: int) -> dict[str, Tensor]:

@@ -206,6 +206,7 @@ class SVI:
         If the option is set and there can be none, a warning says why.
         """
         self.captured: Captured | None = None
+        self.captured_validation: Captured | None = None
         if not self.training.cuda_graph:
             return
         kind, optimizer = self.fabric.device.type, self.optimizer.optimizer
@@ -220,6 +221,7 @@ class SVI:
             warnings.warn(f"the training step runs without a CUDA graph: {'; '.join(obstacles)}", stacklevel=3)
             return
         self.captured = Captured("the training step", self.fabric.device)
+        self.captured_validation = Captured("validation", self.fabric.device)
         for parameter in self.parameters if self.training.momentum else ():
             # torch would leave it uninitialised if the first step is refused
             optimizer.state[parameter].setdefault("momentum_buffer", torch.zeros_like(parameter))
@@ -539,8 +541,6 @@ class SVI:
             data: held-out data.
             feeding: probability of scheduled sampling; 0 to read the true past.
         """
-        objective = stage_at(self.plan, self.state.step)[1].objective
-        last = self.training.steps  # the last weights of the schedules, so that losses can be compared
         self.settle()
         sums, fabric = dict[str, Tensor](), self.fabric
         size = min(self.training.batch_size, math.ceil(len(data) / fabric.world_size))
@@ -555,15 +555,33 @@ class SVI:
             with self._drawing(random), torch.no_grad():  # other threads may run between two batches
                 if (batch := next(batches, None)) is None:
                     break
-                location = f"validation after step {self.state.step}"
-                terms, _ = self._terms(self._convert(batch), objective, location, feeding)
-                sums_of_batch = _sums(terms)
-                if not terms.likelihood or (isinstance(objective, RequiresDraws) and objective.select == "loss"):
-                    sums_of_batch["loss"] = objective(terms, last).double() * sums_of_batch["steps"]
-                for name, value in sums_of_batch.items():
-                    sums[name] = sums[name] + value if name in sums else value
+                for name, value in self._held_out_sums(self._convert(batch), feeding).items():
+                    sums[name] = sums[name] + value if name in sums else value.clone()
         totals = self.total(torch.stack(list(sums.values())) * shares)
         return _per_step(dict(zip(sums, totals, strict=True)))
+
+    def _held_out_sums(self, batch: Batch, feeding: float) -> Mapping[str, Tensor]:
+        """Return the sums of a held-out batch, by a CUDA graph if there is one for its kind."""
+        number, stage = stage_at(self.plan, self.state.step)
+        objective, location = stage.objective, f"validation after step {self.state.step}"
+
+        def sums(batch: Batch) -> dict[str, Tensor]:
+            terms, _ = self._terms(batch, objective, location, feeding)
+            values = _sums(terms)
+            if not terms.likelihood or (isinstance(objective, RequiresDraws) and objective.select == "loss"):
+                # the last weights of the schedules, so that losses can be compared
+                values["loss"] = objective(terms, self.training.steps).double() * values["steps"]
+            return values
+
+        def record(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            with deferring() as checks:
+                values = sums(Batch.from_leaves(inputs))
+            return {**values, "failed": any_failed(checks, self.fabric.device)}
+
+        if self.captured_validation is None:
+            return sums(batch)
+        results = dict(self.captured_validation((number, feeding), record, batch.leaves()))
+        return sums(batch) if results.pop("failed") else results  # raises the error of the failed check
 
     def _convert(self, batch: AnyBatch) -> Batch:
         """Return a batch as tensors, in the precision of the model unless it is a `DynamicalVAE`, which converts."""

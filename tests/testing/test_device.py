@@ -274,32 +274,39 @@ def steps_of(svi, recipe, count):
 
 
 @pytest.mark.filterwarnings("ignore:the training step runs without a CUDA graph")
+@pytest.mark.filterwarnings("ignore:validation runs without a CUDA graph")
 @pytest.mark.parametrize("name", METHODS)
 def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
     """Draws are equal bit for bit, and terms up to rounding."""
     count, runs = 12 if name == "mix-and-match" else 7, []  # a curriculum has a graph only once it is constant
     for simulated in (False, True):
-        model, recipe, _, _ = small_method(name, count)
+        model, recipe, train, _ = small_method(name, count)
+        held_out = train.sample(3, torch.Generator().manual_seed(1))
         options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False}
         options["learning_rate"] = 2**-10  # graphs read it in float32, which represents it exactly
         with simulated_gpu() if simulated else nullcontext():
             model = move(model.double()) if simulated else model.double()
             svi = dvae.SVI(model, stages=recipe.stages, cuda_graph=simulated, **options)
             svi.init()
-            runs.append((steps_of(svi, recipe, count), svi.random["torch"]))
-    torch.testing.assert_close(runs[1][0], runs[0][0], rtol=1e-7, atol=1e-7)
-    assert torch.equal(runs[1][1], runs[0][1])
-    obstacles = [place for places in svi.captured.obstacles.values() for place in places]
+            steps = steps_of(svi, recipe, count - 1)
+            rows = [svi.evaluate(held_out) for _ in range(WARM_UP + 1)]
+            steps += steps_of(svi, recipe, 1)
+            runs.append((steps, [*rows, svi.evaluate(held_out)], svi.random["torch"]))
+    torch.testing.assert_close(runs[1][:2], runs[0][:2], rtol=1e-7, atol=1e-7)
+    assert torch.equal(runs[1][2], runs[0][2])
+    captured = svi.captured, svi.captured_validation
+    obstacles = [place for each in captured for places in each.obstacles.values() for place in places]
     if name in UNCAPTURED:
         assert obstacles
         assert all(UNCAPTURED[name] in place for place in obstacles)
     else:
         assert not obstacles
-        assert svi.captured.graphs
+        assert all(each.graphs for each in captured)
 
 
 @on_gpu
 @pytest.mark.filterwarnings("ignore:the training step runs without a CUDA graph")
+@pytest.mark.filterwarnings("ignore:validation runs without a CUDA graph")
 @pytest.mark.parametrize("name", METHODS)
 def test_replayed_steps_on_a_gpu_equal_steps_without_graphs(name, small_method):
     """Over 50 steps; the random states are equal."""
