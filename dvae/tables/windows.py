@@ -18,7 +18,7 @@ from torch import Tensor
 from ..data.batch import Batch
 from ..data.blocks import cut_windows, hash_list, row_blocks
 from ..data.sequences import Sequences, columns_of
-from ..inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
+from ..inference.evaluation.evaluation_windows import seeded_evaluation
 from ..options import Count, require
 from ..program.model import DynamicalVAE
 from .calendar import Calendar
@@ -334,7 +334,7 @@ class PanelWindows:
         past, targets = batch.past(observed), batch.mask_to_nan().numpy()
         with seeded_evaluation(model, seed):
             parts = [
-                model.forecast(on_device_of(model, part), horizon, samples, draw_emission=True)["x"].cpu().numpy()
+                model.forecast(part, horizon, samples, draw_emission=True)["x"].cpu().numpy()
                 for part in Sequences(past).batches(AT_ONCE)
             ]
         keys = [(name, start + observed) for _, name, start in self.keys]
@@ -363,7 +363,7 @@ class PanelWindows:
             raise ValueError(f"no target is missing in {self.panel.name}")
         with seeded_evaluation(model, seed):
             parts = [
-                model.impute(on_device_of(model, part), samples, draw=True, particles=particles)["x"].cpu().numpy()
+                model.impute(part, samples, draw=True, particles=particles)["x"].cpu().numpy()
                 for part in Sequences(batch).batches(AT_ONCE)
             ]
         count, steps = batch["x"].shape[:2]

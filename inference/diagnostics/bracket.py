@@ -40,7 +40,7 @@ from ..bounds.particles import fivo_bound, obstacle
 from ..bounds.semi_amortized import missing_latents, require_local, semi_amortized_guide
 from ..bounds.teacher_forced import length_of
 from ..evaluation.estimates import Estimate, TwoWayErrors, decimals, number
-from ..evaluation.evaluation_windows import cluster_index, on_device_of, refuse_non_finite, seeded_evaluation
+from ..evaluation.evaluation_windows import cluster_index, refuse_non_finite, seeded_evaluation
 from ..evaluation.record import Dims
 from ..evaluation.result import Result, Table, new_figure, progress_bar, styled
 
@@ -323,7 +323,7 @@ def bracket(
     indices = torch.randperm(size, generator=generator)[:count]
     batch, keys = all_rows.rows(indices), [keys[n] for n in indices.tolist()]
     parts = [slice(first, first + batch_size) for first in range(0, len(keys), batch_size)]
-    batches = [model.read(on_device_of(model, batch.rows(part))) for part in parts]
+    batches = [model.read(batch.rows(part)) for part in parts]
     if fitting:
         try:
             require_local(model)

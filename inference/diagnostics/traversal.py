@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
-from ..evaluation.evaluation_windows import on_device_of, seeded_evaluation
+from ..evaluation.evaluation_windows import seeded_evaluation
 from .checks import decode
 
 
@@ -105,7 +105,7 @@ def traverse(
     if unit not in ("prior", "posterior"):
         raise ValueError(f"unit must be 'prior' or 'posterior', got {unit!r}")
     _check_path(model, latent, free)
-    data = on_device_of(model, model.read(batch))
+    data = model.read(batch)
     if partial := {"lengths", "mask"} & data.keys():
         raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
     with seeded_evaluation(model, seed):

@@ -33,7 +33,7 @@ from ...inference.evaluation.compare import compare
 from ...inference.evaluation.comparison import KHAT, Comparison
 from ...inference.evaluation.conformal import PredictionBands
 from ...inference.evaluation.evaluation import Evaluation
-from ...inference.evaluation.evaluation_windows import on_device_of, seeded_evaluation
+from ...inference.evaluation.evaluation_windows import seeded_evaluation
 from ...inference.evaluation.record import plain
 from ...inference.evaluation.result import Table, error_message, literal_text, new_figure, progress_bar
 from ...inference.training.checkpoints import CheckpointError, Run
@@ -366,7 +366,7 @@ def _latents(run: Loaded, windows: HeldOutWindows, seed: int) -> Markup:
         return paragraph("Nothing is latent.")
     with seeded_evaluation(model, seed):
         batch = windows.all()
-        data = on_device_of(model, model.read(batch))
+        data = model.read(batch)
         size, length = (data["x"] if "x" in data else batch["x"]).shape[:2]
         inferred = model.guide(repeat(data, DRAWS))
         context = {name: value for name, value in data.items() if name in model.context}
