@@ -228,7 +228,9 @@ def spread() -> Table:
     return Table(["", "seeds", "standard deviation", "decided from"], lines)
 
 
-def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: int) -> None:
+def work(
+    data: Path, runs: Path, stored: Path, sections: Sequence[str], cases: Sequence[str], seeds: Sequence[int], jobs: int
+) -> None:
     """Fit and score missing results."""
     datasets = {each.protocol.name: MotionData.open(data, each.protocol) for each in SECTIONS.values()}
     protocols = [SECTIONS[name].protocol for name in sections if name != "metric_models"]
@@ -243,11 +245,11 @@ def work(data: Path, runs: Path, stored: Path, sections: Sequence[str], jobs: in
         section = SECTIONS[name]
         data_set = datasets[section.protocol.name]
         of_references(data_set, Store(stored, "references"), metric_models)
-        for case in section.cases:
-            if seeds := [seed for seed in section.seeds if store.is_missing(case, seed)]:
+        for case in [case for case in section.cases if not cases or case in cases]:
+            if missing := [seed for seed in seeds or section.seeds if store.is_missing(case, seed)]:
                 method, training = section.of(case, prior)
-                paths = sweep_seeds(case, method, data_set, runs / name, seeds, training, jobs)
-                for seed, path in zip(seeds, paths, strict=True):
+                paths = sweep_seeds(case, method, data_set, runs / name, missing, training, jobs)
+                for seed, path in zip(missing, paths, strict=True):
                     store.add(case, seed, score(path, data_set, metric_models))
 
 
@@ -255,6 +257,8 @@ def main(
     runs: tyro.conf.Positional[Path],
     data: Path | None = None,
     sections: tuple[str, ...] = ("metric_models", SEEDS, *SECTIONS),
+    cases: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
     jobs: int = 1,
     stored: Path = SCORES / "tuning.json",
     results: Path | None = None,
@@ -265,14 +269,17 @@ def main(
         runs: folder of the run directories.
         data: bandai2.npz; without it nothing is fitted.
         sections: names of sections.
+        cases: names of cases to fit; all cases of a section if empty.
+        seeds: seeds to fit; those of the section if empty.
         jobs: number of runs at a time.
         stored: the file of scores.
         results: folder of the tables, such as benchmarks/results; None prints them.
     """
     refuse_unknown("section", sections, ("metric_models", SEEDS, *SECTIONS))
+    refuse_unknown("case", cases, (case for name in sections if name in SECTIONS for case in SECTIONS[name].cases))
     names = [name for name in sections if name != SEEDS]
     if data is not None:
-        work(data, runs, stored, names, jobs)
+        work(data, runs, stored, names, cases, seeds, jobs)
     if SEEDS in sections:
         write(results, {"tuning/seeds": spread()})
     references = Store(stored, "references").scores
