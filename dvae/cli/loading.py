@@ -36,7 +36,7 @@ FORECASTING = ("motion", "panel")
 """Kinds of data with forecasts."""
 SCORES: Mapping[str, Scores] = {"motion": motion.scores, "panel": panel_scores}
 """Scores of forecasts, by kind of data."""
-Device = Literal["cpu", "cuda", "mps"]
+Device = Literal["cpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def load(path: Path, data: str | None, use: Use = ON_CPU) -> runs.Loaded:
 
     Raises:
         ValueError: `use.failed` is False, and the run failed or has no optimiser step yet.
-        UsageError: torch has no such device.
+        UsageError: torch finds no GPU.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the note below covers more cases than the warning of `runs.load`
@@ -86,8 +86,8 @@ def load(path: Path, data: str | None, use: Use = ON_CPU) -> runs.Loaded:
     if loaded.unfinished:
         note(loaded.unfinished)
     if use.accelerator != "cpu":
-        if not getattr(torch, use.accelerator).is_available():
-            raise UsageError(f"--accelerator {use.accelerator}: torch finds no such device; leave the option out")
+        if not torch.cuda.is_available():
+            raise UsageError(f"--accelerator {use.accelerator}: torch finds no GPU; leave the option out")
         loaded.model.to(use.accelerator)
     return loaded
 

@@ -82,4 +82,4 @@ def assert_equal(one, other):
 def test_a_missing_gpu_is_an_error(fitted, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(["forecast", str(fitted), "--accelerator", "cuda", "--out", str(tmp_path / "f.npz")]) == 2
-    assert "--accelerator cuda: torch finds no such device" in capsys.readouterr().err
+    assert "--accelerator cuda: torch finds no GPU" in capsys.readouterr().err
