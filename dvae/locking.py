@@ -4,7 +4,7 @@ Two programs running at the same time would share one handler stack and one stre
 and running a program therefore hold the lock `serialized`: in `DynamicalVAE.running`, in the terms of a bound, and in a
 step of `SVI`. `seeded` holds it for a whole block, with another random state. Threads wait for one such step, not for a
 whole fit. Processes are independent (`dvae.runs.sweep`). If a process forks while another thread holds the lock, the
-child starts with a free lock and an empty handler stack.
+child starts with a free lock, an empty handler stack and no plates.
 """
 
 from __future__ import annotations
@@ -43,10 +43,11 @@ class _ProgramLock(ContextDecorator):
         if self._lock.acquire(blocking=False):
             self._lock.release()
             return
-        from pyro.poutine.runtime import _PYRO_STACK
+        from pyro.poutine.runtime import _DIM_ALLOCATOR, _PYRO_STACK
 
         self._lock = threading.RLock()
         _PYRO_STACK.clear()
+        _DIM_ALLOCATOR._stack.clear()  # dimensions of the plates of that thread
 
 
 serialized = _ProgramLock()
@@ -64,8 +65,16 @@ def seeded(seed: int | None, device: Any = None) -> Iterator[None]:
 
     with serialized, torch.random.fork_rng([device] if device is not None and device.type == "cuda" else []):
         if seed is not None:
-            torch.manual_seed(seed)
+            seed_torch(seed)
         yield
+
+
+def seed_torch(seed: int) -> None:
+    """Set torch's random seed while no process can fork: the child would wait forever for a lock of `torch.cuda`."""
+    import torch
+
+    with no_fork:
+        torch.manual_seed(seed)
 
 
 no_fork = threading.RLock()

@@ -269,8 +269,8 @@ def main(
         runs: folder of the run directories.
         data: bandai2.npz; without it nothing is fitted.
         sections: names of sections.
-        cases: names of cases to fit; all cases of a section if empty.
-        seeds: seeds to fit; those of the section if empty.
+        cases: names of cases to fit; all cases of a section if empty. Metric models have none.
+        seeds: seeds to fit, in place of the section's.
         jobs: number of runs at a time.
         stored: the file of scores.
         results: folder of the tables, such as benchmarks/results; None prints them.
@@ -284,15 +284,15 @@ def main(
         write(results, {"tuning/seeds": spread()})
     references = Store(stored, "references").scores
     for name in names:
-        columns, cases, reference_rows = COLUMNS_OF_METRIC_MODELS, OF_METRIC_MODELS, {}
+        columns, shown, reference_rows = COLUMNS_OF_METRIC_MODELS, OF_METRIC_MODELS, {}
         if name != "metric_models":
             section = SECTIONS[name]
-            columns, cases = section.columns, [*section.cases]
+            columns, shown = section.columns, [*section.cases]
             reference_rows = {row: references.get(f"{section.protocol.name}: {row}") for row in REFERENCES}
         stored_scores = Store(stored, name).scores
         rows = {
             row: [*seeds.values()]
-            for row, seeds in {**reference_rows, **{c: stored_scores.get(c) for c in cases}}.items()
+            for row, seeds in {**reference_rows, **{c: stored_scores.get(c) for c in shown}}.items()
             if seeds
         }
         head = name.replace("_", " ")

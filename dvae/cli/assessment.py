@@ -222,6 +222,8 @@ def evaluate(
     if several_futures and control.exchange is not None:
         raise UsageError("--several-futures needs multimodal futures, which exchanged poses do not have; leave one out")
     external.check()
+    if not run and (cuda_graph or (use != ON_CPU and pose_prior is None)):
+        raise UsageError("--failed, --accelerator and --cuda-graph are for runs; leave them out")
     is_of_segments = bool(run) and loading.kind_of(run, data) == "segments"
     if external.forecasts and (measure != "forecasts" or is_of_segments):
         raise UsageError("--forecasts is for scores of forecasts, not for another --measure or for segments")
@@ -417,7 +419,7 @@ def _measure(
         untrained = {}
         for name, run in zip(models, loaded, strict=True):
             with seeded(run.config.training.seed):
-                untrained[name] = run.method.build(run.schema)
+                untrained[name] = run.method.build(run.schema).to(scoring.use.accelerator)
         past = windows.all().past(windows.protocol.observed).rows(rows)
         result = code_scores(models, past, scoring.samples, seed, untrained)
     record = f"{loading.record(measure, loaded[0], data_set)}{'-by-action' * angles.actions}.json"

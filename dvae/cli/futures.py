@@ -383,6 +383,8 @@ def animate(
         raise UsageError(f"--fix is for futures drawn from a run; {source} is not a run directory; leave it out")
     elif data is not None:
         raise UsageError(f"--data is the path of the data of a run; {source} is not a run directory; leave it out")
+    elif use != ON_CPU:
+        raise UsageError(f"--failed and --accelerator are for runs; {source} is not a run directory; leave them out")
     elif source != SIMULATED and motion.is_forecasts(source):
         index, futures = _load_window(source, clip, window, samples)
     elif window is not None or samples is not None or figure is not None:

@@ -41,7 +41,7 @@ Device = Literal["cpu", "cuda"]
 
 @dataclass(frozen=True)
 class Use:
-    """Options of every command that uses runs.
+    """Options of commands that score runs or draw from them.
 
     Args:
         failed: use the current weights of a run that failed or has made no step.
@@ -53,6 +53,12 @@ class Use:
 
 
 ON_CPU = Use()
+
+
+def require_device(use: Use) -> None:
+    """Raise a `UsageError` if the device does not exist."""
+    if use.accelerator == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--accelerator cuda: torch finds no GPU; leave the option out")
 
 
 def load_run(path: Path, data: str | None, kinds: Collection[str] = ("motion",), use: Use = ON_CPU) -> runs.Loaded:
@@ -78,6 +84,7 @@ def load(path: Path, data: str | None, use: Use = ON_CPU) -> runs.Loaded:
         ValueError: `use.failed` is False, and the run failed or has no optimiser step yet.
         UsageError: torch finds no GPU.
     """
+    require_device(use)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the note below covers more cases than the warning of `runs.load`
         loaded = runs.load(path, data)
@@ -85,10 +92,8 @@ def load(path: Path, data: str | None, use: Use = ON_CPU) -> runs.Loaded:
         raise ValueError(f"{loaded.unfinished}; or use its current weights with --failed")
     if loaded.unfinished:
         note(loaded.unfinished)
-    if use.accelerator != "cpu":
-        if not torch.cuda.is_available():
-            raise UsageError(f"--accelerator {use.accelerator}: torch finds no GPU; leave the option out")
-        loaded.model.to(use.accelerator)
+    if use.accelerator == "cuda":
+        loaded.model.to("cuda")
     return loaded
 
 

@@ -45,6 +45,7 @@ OPTIMISERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch
 
 _TABLES = "log_likelihood", "kl", "energies", "steps"
 """Tables of tensors in `Terms`."""
+ONLY_WITHIN = "a check of the batch failed only within a CUDA graph; set cuda_graph=False"
 
 
 class NonFiniteError(FloatingPointError):
@@ -180,10 +181,13 @@ class SVI:
         Returns:
             State at step 0.
         """
+        # a process forked during imports, or the first calls of parts of torch, would wait forever for their locks
+        with serialized, no_fork:
+            return self._init()
+
+    def _init(self) -> State:
         training = self.training
-        with no_fork:  # imports lightning-fabric, and the first optimiser imports parts of torch
-            self.fabric: Fabric = processes.launch(training)
-            torch.optim.SGD([torch.zeros(1)])
+        self.fabric: Fabric = processes.launch(training)
         with seeded(None, self.fabric.device):
             sgd_options: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
@@ -331,7 +335,7 @@ class SVI:
             self.random |= before
             with self.drawing(), torch.no_grad():  # the program itself raises the error of its check
                 self._terms(batch, stage.objective, f"step {self.state.step + 1}", sampling, curriculum)
-            raise RuntimeError("a check of the batch failed only within a CUDA graph; set cuda_graph=False")
+            raise RuntimeError(ONLY_WITHIN)
         parts: dict[str, dict[str, Tensor]] = {}
         for path, value in results.items():
             part, _, name = path.partition("/")
@@ -534,6 +538,7 @@ class SVI:
         cuda = {"cuda": torch.cuda.get_rng_state(self.fabric.device)} if on_cuda else {}
         return {"torch": torch.get_rng_state(), **cuda}
 
+    @torch.inference_mode(False)
     def _score(self, data: Batched, feeding: float) -> dict[str, float]:
         """Return the unweighted terms on held-out data, per step, with the same draws at each call.
 
@@ -580,8 +585,13 @@ class SVI:
 
         if self.captured_validation is None:
             return sums(batch)
+        before = self._random_state()
         results = dict(self.captured_validation((number, feeding), record, batch.leaves()))
-        return sums(batch) if results.pop("failed") else results  # raises the error of the failed check
+        if results.pop("failed"):
+            with self._drawing(before):
+                sums(batch)  # the program itself raises the error of its check
+            raise RuntimeError(ONLY_WITHIN)
+        return results
 
     def _convert(self, batch: AnyBatch) -> Batch:
         """Return a batch as tensors, in the precision of the model unless it is a `DynamicalVAE`, which converts."""

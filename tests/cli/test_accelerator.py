@@ -8,16 +8,27 @@ import torch
 
 import dvae
 from dvae.cli import main
-from dvae.motion.data.dataset import MotionData
 from dvae.testing.device import Tape, move, on_device
 
 
 @pytest.fixture(scope="module")
-def fitted(people, tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs") / "srnn"
-    training = dvae.Training(steps=2, batch_size=4, progress=False)
-    dvae.fit(dvae.method("srnn", latent=2, width=8, warm_up=1), MotionData.open(people), out=out, **vars(training))
-    return out
+def words(people, tmp_path_factory):
+    """Return runs by the name that stands for them in `COMMANDS`, and the name of a segment."""
+    folder = tmp_path_factory.mktemp("runs")
+    table = folder / "table.csv"
+    table.write_text("series,t,y\n" + "".join(f"{s},{t},{(3 * s + t) % 7}\n" for s in range(12) for t in range(12)))
+    of_table = ["--data", table, "--id", "series", "--time", "t", "--observed", 4, "--horizon", 2, "--columns", "y"]
+    fits = {
+        "RUN": ["srnn", "--latent", 2, "--width", 8, "--warm-up", 1, "--data", people],
+        "PRIOR": ["pose-prior", "--layers", 1, "--data", people],
+        "SEGMENTS": ["motion-latent", "--latent", 2, "--widths", 8, "--data", people],
+        "TABLE": ["vrnn", "--latent", 2, "--warm-up", 1, "--width", 8, *of_table],
+    }
+    for name, options in fits.items():
+        options += ["--steps", 2, "--batch-size", 4, "--accelerator", "cpu", "--out", folder / name]
+        assert main(["fit", *map(str, options)]) == 0
+    (clip,) = dvae.load(folder / "SEGMENTS").data.windows("test").motion.clips[:1]
+    return {name: str(folder / name) for name in fits} | {"CLIP": "/".join(clip.key)}
 
 
 COMMANDS = {
@@ -28,6 +39,9 @@ COMMANDS = {
     "compare": ("compare RUN --samples 2 --particles 2 --contrasts 4", "json"),
     "forecast": ("forecast RUN --samples 2", "npz"),
     "posterior": ("check posterior RUN --windows 1 --frames 3 --warmup 4 --draws 4", "json"),
+    "pose prior": ("evaluate RUN --samples 2 --pose-prior PRIOR", "json"),
+    "table": ("evaluate TABLE --samples 3", "json"),
+    "segments": ("impute SEGMENTS --from CLIP --seen points --points 5 --starts 1 --steps 2 --samples 1", "npz"),
 }
 
 
@@ -41,27 +55,27 @@ def contents(path):
 
 @pytest.mark.filterwarnings("ignore:forecasts run without a CUDA graph")
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_computes_the_same_on_a_gpu(name, fitted, tmp_path, monkeypatch):
+def test_a_command_computes_the_same_on_a_gpu(name, words, tmp_path, monkeypatch):
     command, suffix = COMMANDS[name]
-    words = command.replace("RUN", str(fitted)).split()
-    assert main([*words, "--out", str(tmp_path / f"cpu.{suffix}")]) == 0
+    command = [words.get(word, word) for word in command.split()]
+    assert main([*command, "--out", str(tmp_path / f"cpu.{suffix}")]) == 0
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.nn.Module, "to", lambda module, _: move(module))
     replays, replay = [], Tape.replay
     monkeypatch.setattr(Tape, "replay", lambda tape: replays.append(replay(tape)))
     with on_device() as traffic:
-        assert main([*words, "--accelerator", "cuda", "--out", str(tmp_path / f"gpu.{suffix}")]) == 0
+        assert main([*command, "--accelerator", "cuda", "--out", str(tmp_path / f"gpu.{suffix}")]) == 0
         assert traffic.reads
-    assert bool(replays) == ("--cuda-graph" in words)
+    assert bool(replays) == ("--cuda-graph" in command)
     assert_equal(*(contents(tmp_path / f"{device}.{suffix}") for device in ("cpu", "gpu")))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_runs_on_a_gpu(name, fitted, tmp_path):
+def test_a_command_runs_on_a_gpu(name, words, tmp_path):
     command, suffix = COMMANDS[name]
-    words = command.replace("RUN", str(fitted)).split()
-    assert main([*words, "--accelerator", "cuda", "--out", str(tmp_path / f"gpu.{suffix}")]) == 0
+    command = [words.get(word, word) for word in command.split()]
+    assert main([*command, "--accelerator", "cuda", "--out", str(tmp_path / f"gpu.{suffix}")]) == 0
 
 
 def assert_equal(one, other):
@@ -79,7 +93,11 @@ def assert_equal(one, other):
         assert one == other
 
 
-def test_a_missing_gpu_is_an_error(fitted, tmp_path, capsys, monkeypatch):
+def test_a_missing_gpu_is_an_error(words, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert main(["forecast", str(fitted), "--accelerator", "cuda", "--out", str(tmp_path / "f.npz")]) == 2
+    assert main(["forecast", words["RUN"], "--accelerator", "cuda", "--out", str(tmp_path / "f.npz")]) == 2
     assert "--accelerator cuda: torch finds no GPU" in capsys.readouterr().err
+    (tmp_path / "f.csv").write_text("")
+    for command in (f"evaluate --forecasts {tmp_path / 'f.csv'} --data simulated", "animate simulated --out f.html"):
+        assert main([*command.split(), "--accelerator", "cuda"]) == 2
+        assert "for runs" in capsys.readouterr().err

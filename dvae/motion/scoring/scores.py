@@ -426,8 +426,9 @@ def _pose_nll(prior: Any, observed: int) -> Measure:
     @torch.no_grad()
     def function(forecasts: Tensor, truth: Tensor, past: Batch, index: Tensor) -> Tensor:
         history = interpolate_missing(past["x"], past.mask())[:, None].expand(-1, forecasts.shape[1], -1, -1)
-        motion = prior.facing(torch.cat([history, forecasts], 2))[:, :, observed:]
-        return pose_prior_energy(motion.movedim(1, 0), prior, prior.skeleton)
+        motion = on_device_of(prior, {"x": torch.cat([history, forecasts], 2)})["x"]
+        poses = prior.facing(motion)[:, :, observed:].movedim(1, 0)
+        return pose_prior_energy(poses, prior, prior.skeleton).to(forecasts)
 
     return Measure("pose NLL", function, "nats", basis={"pose prior": _hash(prior)})
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from ...data.batch import WHOLE
 from ...data.npy import NpyError
 from ...inference.diagnostics.posteriors import Descent
+from ...inference.evaluation.evaluation_windows import on_device_of
 from ...inference.evaluation.result import Table
 from ...options import nearest
 from ..bodies import vertex_error
@@ -190,7 +191,8 @@ def recover(
     completed = complete(model, observations, **options, seed=seed, progress=progress)
     bound = completed.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
     distances = completed.program.distances(completed.observations, completed.posterior.mode[LATENT], completed.shape)
-    return Recovered(completed, keys, completed.draw(DRAWS, seed), bound.khat, distances, truth)
+    true = None if truth is None else on_device_of(model, truth)
+    return Recovered(completed, keys, completed.draw(DRAWS, seed), bound.khat, distances, true)
 
 
 def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
