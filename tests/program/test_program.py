@@ -150,24 +150,38 @@ def test_bounds_and_the_construction_of_models_wait_for_the_lock():
     assert len(results) == 8
 
 
-FORK_DURING_A_FIT = """
+FORK = """
 import os, signal, sys, threading, time
-import dvae, torch
+import dvae, pyro, torch
+from dvae.locking import serialized
 
 def fit(steps):
     sizes, network = {"z": 1, "x": 1}, dvae.networks.Recurrent(4)
     model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", sizes, network)
     dvae.fit(model, torch.randn(8, 5, 1), steps=steps, progress=False)
 
-thread = threading.Thread(target=fit, args=(10,))
-thread.start()
-while "lightning_fabric" not in sys.modules:  # whose import takes a second
-    time.sleep(0.01)
+def hold():
+    with serialized, pyro.plate("sequences", 8):
+        began.set()
+        ended.wait()
+
+began, ended = threading.Event(), threading.Event()
+if sys.argv[1] == "imports":
+    thread = threading.Thread(target=fit, args=(10,))
+    thread.start()
+    while "lightning_fabric" not in sys.modules:  # whose import takes a second
+        time.sleep(0.01)
+else:
+    fit(1)
+    thread = threading.Thread(target=hold)
+    thread.start()
+    began.wait()
 child = os.fork()
 if not child:
     signal.alarm(60)  # ends it if it waits for a lock
     fit(1)
     os._exit(0)
+ended.set()
 thread.join()
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
@@ -175,8 +189,9 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
-def test_a_process_forked_during_a_fit_of_another_thread_can_fit():
-    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK_DURING_A_FIT], check=True, timeout=120)
+@pytest.mark.parametrize("moment", ["imports", "a program"])
+def test_a_process_forked_during_a_fit_of_another_thread_can_fit(moment):
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK, moment], check=True, timeout=120)
 
 
 # ---------------------------------------------------------------------------------------------------------- engines
