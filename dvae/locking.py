@@ -3,8 +3,9 @@
 Two programs running at the same time would share one handler stack and one stream of random numbers. Building a model
 and running a program therefore hold the lock `serialized`: in `DynamicalVAE.running`, in the terms of a bound, and in a
 step of `SVI`. `seeded` holds it for a whole block, with another random state. Threads wait for one such step, not for a
-whole fit. Processes are independent (`dvae.runs.sweep`). If a process forks while another thread holds the lock, the
-child starts with a free lock, an empty handler stack and no plates.
+whole fit. Processes are independent (`dvae.runs.sweep`). A fork waits for the lock too, because a child would wait
+forever for locks that another thread holds, such as those of oneDNN and of `torch.manual_seed`. If it waits for more
+than five seconds, the child starts with a free lock, an empty handler stack and no plates.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from collections.abc import Iterator
 from contextlib import ContextDecorator, contextmanager
 from typing import Any
 
+LONGEST_WAIT = 5.0
+"""Seconds that a fork waits for the lock; a thread that holds it may wait for the thread that forks."""
 SHAPES = re.compile(r"\n\s*Trace Shapes:.*", re.DOTALL)
 """The table that Pyro appends to an error raised inside a program."""
 
@@ -38,9 +41,16 @@ class _ProgramLock(ContextDecorator):
         if error is not None and error.args and isinstance(error.args[0], str):
             error.args = (SHAPES.sub("", error.args[0]), *error.args[1:])
 
-    def _reset_in_child(self) -> None:
-        """Replace a lock held by a thread of the parent process, which does not exist in a forked child."""
-        if self._lock.acquire(blocking=False):
+    def _before_fork(self) -> None:
+        self._is_held_by_fork = self._lock.acquire(timeout=LONGEST_WAIT)
+
+    def _after_fork(self) -> None:
+        if self._is_held_by_fork:
+            self._lock.release()
+
+    def _after_fork_in_child(self) -> None:
+        """Release the lock, or replace one held by a thread of the parent process, which does not exist here."""
+        if self._is_held_by_fork:
             self._lock.release()
             return
         from pyro.poutine.runtime import _DIM_ALLOCATOR, _PYRO_STACK
@@ -65,20 +75,16 @@ def seeded(seed: int | None, device: Any = None) -> Iterator[None]:
 
     with serialized, torch.random.fork_rng([device] if device is not None and device.type == "cuda" else []):
         if seed is not None:
-            seed_torch(seed)
+            torch.manual_seed(seed)
         yield
-
-
-def seed_torch(seed: int) -> None:
-    """Set torch's random seed while no process can fork: the child would wait forever for a lock of `torch.cuda`."""
-    import torch
-
-    with no_fork:
-        torch.manual_seed(seed)
 
 
 no_fork = threading.RLock()
 """A lock held during imports: a child forked during an import would wait forever for the lock of the module."""
 if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(before=no_fork.acquire, after_in_parent=no_fork.release, after_in_child=no_fork.release)
-    os.register_at_fork(after_in_child=serialized._reset_in_child)
+    os.register_at_fork(
+        before=serialized._before_fork,  # runs before the one registered above, in the order of `SVI.init`
+        after_in_parent=serialized._after_fork,
+        after_in_child=serialized._after_fork_in_child,
+    )

@@ -9,7 +9,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ...locking import seed_torch
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
 from ..evaluation.evaluation_windows import seeded_evaluation
@@ -111,7 +110,7 @@ def traverse(
         raise ValueError(f"a traversal needs complete sequences, but these have {', '.join(sorted(partial))}")
     with seeded_evaluation(model, seed):
         scale = _scale(model, data, latent, unit, draws)[list(indices)]
-        seed_torch(seed)
+        torch.manual_seed(seed)
         inferred = model.guide(data)
         offsets = offsets.to(scale)
         fixed = {name: value for name, value in inferred.items() if name not in (*free, latent)}
@@ -121,7 +120,7 @@ def traverse(
             shifted[..., coordinate] += (offsets * unit_scale).reshape(steps, *[1] * (shifted.dim() - 2))
             # Free latents have the same noise at each offset only in separate runs.
             for group in shifted.split(1 if free else steps):
-                seed_torch(seed)
+                torch.manual_seed(seed)
                 latents = {**repeat(fixed, len(group)), latent: group.flatten(0, 1)}
                 decoded.append(decode(model, repeat(data, len(group)), latents, True))
     shape = (len(indices), steps, -1)

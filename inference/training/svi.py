@@ -181,13 +181,10 @@ class SVI:
         Returns:
             State at step 0.
         """
-        # a process forked during imports, or the first calls of parts of torch, would wait forever for their locks
-        with serialized, no_fork:
-            return self._init()
-
-    def _init(self) -> State:
         training = self.training
-        self.fabric: Fabric = processes.launch(training)
+        with no_fork:  # imports lightning-fabric, and the first optimiser imports parts of torch
+            self.fabric: Fabric = processes.launch(training)
+            torch.optim.SGD([torch.zeros(1)])
         with seeded(None, self.fabric.device):
             sgd_options: dict[str, Any] = {"momentum": training.momentum} if training.optimizer == "sgd" else {}
             optimizer = OPTIMISERS[training.optimizer](
