@@ -218,10 +218,13 @@ PATHED = ("ADE", "FDE", "energy score")
 
 @styled
 def draw_scores(rows_by_view: RowsByView, paper: Paper) -> Figure:
-    """Draw scores by number of given paths, over the seeds with all of them; intervals are over clips and seeds."""
+    """Draw scores by number of given paths of rows with the presets' steps, over the seeds with all numbers.
+
+    Intervals are over clips and seeds.
+    """
     figure = new_figure(7, 2.9)
     for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
-        for row in (NEIGHBOURS, *paper.rows):
+        for row in (NEIGHBOURS, *(row for row, options in paper.rows.items() if "steps" not in options)):
             entries_by_count = {view.given: rows[row] for view, rows in rows_by_view.items() if row in rows}
             common = min((len(entry.runs) for entry in entries_by_count.values()), default=0)
             estimates = {
