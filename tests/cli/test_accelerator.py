@@ -13,7 +13,7 @@ from dvae.testing.device import Tape, move, on_device
 
 @pytest.fixture(scope="module")
 def words(people, tmp_path_factory):
-    """Return runs by the name that stands for them in `COMMANDS`, and the name of a segment."""
+    """Return the words of `COMMANDS` in capitals: run directories, and the name of a segment."""
     folder = tmp_path_factory.mktemp("runs")
     table = folder / "table.csv"
     table.write_text("series,t,y\n" + "".join(f"{s},{t},{(3 * s + t) % 7}\n" for s in range(12) for t in range(12)))
