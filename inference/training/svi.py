@@ -543,6 +543,7 @@ class SVI:
             data: held-out data.
             feeding: probability of scheduled sampling; 0 to read the true past.
         """
+        number, stage = stage_at(self.plan, self.state.step)
         self.settle()
         sums, fabric = dict[str, Tensor](), self.fabric
         size = min(self.training.batch_size, math.ceil(len(data) / fabric.world_size))
@@ -557,14 +558,13 @@ class SVI:
             with self._drawing(random), torch.no_grad():  # other threads may run between two batches
                 if (batch := next(batches, None)) is None:
                     break
-                for name, value in self._held_out_sums(self._convert(batch), feeding).items():
+                for name, value in self._held_out_sums(self._convert(batch), number, stage, feeding).items():
                     sums[name] = sums[name] + value if name in sums else value.clone()
         totals = self.total(torch.stack(list(sums.values())) * shares)
         return _per_step(dict(zip(sums, totals, strict=True)))
 
-    def _held_out_sums(self, batch: Batch, feeding: float) -> Mapping[str, Tensor]:
-        """Return the sums of a held-out batch, by a CUDA graph if there is one for its kind."""
-        number, stage = stage_at(self.plan, self.state.step)
+    def _held_out_sums(self, batch: Batch, number: int, stage: Stage, feeding: float) -> Mapping[str, Tensor]:
+        """Return the sums of a held-out batch in a stage, by a CUDA graph if there is one for its kind."""
         objective, location = stage.objective, f"validation after step {self.state.step}"
 
         def sums(batch: Batch) -> dict[str, Tensor]:

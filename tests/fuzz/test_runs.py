@@ -22,6 +22,7 @@ from safetensors.torch import load, save
 import dvae
 from dvae import motion
 from dvae.cli import assessment, futures, segments
+from dvae.cli.loading import ON_CPU
 from dvae.inference.training.checkpoints import BEST, CONFIG, LAST, OPTIMISER, STATE
 from dvae.motion.data.dataset import MotionData
 from dvae.motion.segments.dataset import SegmentData
@@ -207,7 +208,7 @@ def use(call: str, fitted: str, run: Path, data: Path) -> None:
         quick = dvae.Descent(steps=1, starts=1, candidates=1, newton=0)
         glimpse = segments.Glimpse(seen="markers", seconds=0.2)
         recovery = segments.Recovery(glimpse, descent=quick, source=("person_0001",))
-        recovery.run(run, run / "found.npz", 0, 0, str(data), False)
+        recovery.run(run, run / "found.npz", 0, 0, str(data), ON_CPU)
     elif call == "forecast":
         futures.forecast(run, run / "futures.npz", futures.Paths(), samples=1, horizon=2, data=str(data))
     else:
