@@ -419,7 +419,7 @@ def _measure(
         untrained = {}
         for name, run in zip(models, loaded, strict=True):
             with seeded(run.config.training.seed):
-                untrained[name] = run.method.build(run.schema).to(scoring.use.accelerator)
+                untrained[name] = run.method.build(run.schema).to(loading.device_of(scoring.use))
         past = windows.all().past(windows.protocol.observed).rows(rows)
         result = code_scores(models, past, scoring.samples, seed, untrained)
     record = f"{loading.record(measure, loaded[0], data_set)}{'-by-action' * angles.actions}.json"
@@ -529,7 +529,7 @@ def compare(
         stride: frames between the starts of test windows, in place of the protocol's; a larger stride is faster.
         seed: seed of the draws.
         batch_size: number of windows scored at once.
-        accelerator: device that computes; cuda is a GPU.
+        accelerator: device that computes: cpu, cuda or gpu, or auto for a GPU if there is one.
         out: JSON file for the comparison.
         figure: save bounds, differences, k-hat, and KL over time.
     """

@@ -36,7 +36,7 @@ FORECASTING = ("motion", "panel")
 """Kinds of data with forecasts."""
 SCORES: Mapping[str, Scores] = {"motion": motion.scores, "panel": panel_scores}
 """Scores of forecasts, by kind of data."""
-Device = Literal["cpu", "cuda"]
+Device = Literal["auto", "cpu", "gpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Use:
 
     Args:
         failed: use the current weights of a run that failed or has made no step.
-        accelerator: device that computes; cuda is a GPU.
+        accelerator: device that computes: cpu, cuda or gpu, or auto for a GPU if there is one.
     """
 
     failed: Expert[bool] = False
@@ -55,10 +55,17 @@ class Use:
 ON_CPU = Use()
 
 
-def require_device(use: Use) -> None:
-    """Raise a `UsageError` if the device does not exist."""
-    if use.accelerator == "cuda" and not torch.cuda.is_available():
-        raise UsageError("--accelerator cuda: torch finds no GPU; leave the option out")
+def device_of(use: Use) -> Literal["cpu", "cuda"]:
+    """Return torch's name of the device.
+
+    Raises:
+        UsageError: torch finds no GPU.
+    """
+    if use.accelerator == "cpu" or torch.cuda.is_available():
+        return "cpu" if use.accelerator == "cpu" else "cuda"
+    if use.accelerator == "auto":
+        return "cpu"
+    raise UsageError(f"--accelerator {use.accelerator}: torch finds no GPU; leave the option out")
 
 
 def load_run(path: Path, data: str | None, kinds: Collection[str] = ("motion",), use: Use = ON_CPU) -> runs.Loaded:
@@ -84,7 +91,7 @@ def load(path: Path, data: str | None, use: Use = ON_CPU) -> runs.Loaded:
         ValueError: `use.failed` is False, and the run failed or has no optimiser step yet.
         UsageError: torch finds no GPU.
     """
-    require_device(use)
+    device = device_of(use)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the note below covers more cases than the warning of `runs.load`
         loaded = runs.load(path, data)
@@ -92,8 +99,8 @@ def load(path: Path, data: str | None, use: Use = ON_CPU) -> runs.Loaded:
         raise ValueError(f"{loaded.unfinished}; or use its current weights with --failed")
     if loaded.unfinished:
         note(loaded.unfinished)
-    if use.accelerator == "cuda":
-        loaded.model.to("cuda")
+    if device != "cpu":
+        loaded.model.to(device)
     return loaded
 
 

@@ -149,7 +149,7 @@ class Recovery:
             raise UsageError("give observations: --from NAME --seen KIND for segments of the run, or --file")
         if self.file is not None and self.glimpse != Glimpse():
             raise UsageError("--file contains all observations; --seen and its options are for segments in --from")
-        loading.require_device(use)
+        device = loading.device_of(use)
         loaded = loading.load_run(run, data, ("segments",), replace(use, accelerator="cpu"))
         model, truth, takes = loaded.model, None, set()
         if self.file is None:
@@ -168,7 +168,7 @@ class Recovery:
             raise UsageError(
                 f"--out {out} can show one of {len(keys)} segments; end its name in .npz, or use no suffix"
             )
-        model.to(use.accelerator)  # not before, because observations are simulated on the CPU
+        model.to(device)  # not before, because observations are simulated on the CPU
         training_segments = None if data_set is None else _other_segments(data_set, takes)
         options: dict[str, Any] = {"truth": truth, "deviations": self.deviations, "known": training_segments}
         options |= {"descent": self.descent, "aggregate": self.aggregate, "two_way": self.two_way}

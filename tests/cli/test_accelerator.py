@@ -95,6 +95,7 @@ def assert_equal(one, other):
 
 def test_a_missing_gpu_is_an_error(words, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(["forecast", words["RUN"], "--accelerator", "auto", "--out", str(tmp_path / "f.npz")]) == 0
     assert main(["forecast", words["RUN"], "--accelerator", "cuda", "--out", str(tmp_path / "f.npz")]) == 2
     assert "--accelerator cuda: torch finds no GPU" in capsys.readouterr().err
     (tmp_path / "f.csv").write_text("")
