@@ -119,6 +119,32 @@ class Captured:
         self.graphs[kind] = self._record(function, device_inputs)
         return self.graphs[kind].replay(inputs)
 
+    def checked(self, kind: Hashable, function: Function, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the results as a call does, of a function that may call `defer`.
+
+        If a check fails, the function is called again with the same random numbers and without a graph, so that the
+        check raises its error.
+        """
+
+        def record(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            with deferring() as checks:
+                results = function(inputs)
+            return {**results, "failed": any_failed(checks, self.device)}
+
+        random = torch.get_rng_state(), torch.cuda.get_rng_state(self.device)
+        results = dict(self(kind, record, inputs))
+        if not results.pop("failed"):
+            return results
+        torch.set_rng_state(random[0])
+        torch.cuda.set_rng_state(random[1], self.device)
+        return function({name: value.to(self.device) for name, value in inputs.items()})
+
+    def clear(self) -> None:
+        """Drop all graphs, and forget the calls."""
+        self.graphs.clear()
+        self.obstacles.clear()
+        self._calls.clear()
+
     def _record(self, function: Function, inputs: Mapping[str, Tensor]) -> _Graph:
         memory = {name: value.clone() for name, value in inputs.items()}
         graph, current = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self.device)

@@ -147,6 +147,8 @@ class Traffic(TorchDispatchMode):
         is_within = self.within and not tensors and device is not None
         if not (device_tensors or is_requested or is_within):
             return func(*args, **kwargs)
+        if kwargs.get("generator") is not None:
+            raise RuntimeError(f"{packet} on {OnDevice.device} with a generator of the CPU; draw without one")
         if cpu_tensors:
             shapes = ", ".join(str(tuple(value.shape)) for value in cpu_tensors)
             raise RuntimeError(

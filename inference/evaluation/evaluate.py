@@ -15,6 +15,7 @@ import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from reprlib import repr as brief
 from typing import Any
 
@@ -22,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...capture import Captured, any_failed, deferring
+from ...capture import Captured
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, axis_names
 from ...options import Count, Delay, require
@@ -369,26 +370,14 @@ def forecaster_of(
     """
     horizon, device = windows.futures.shape[1], next(model.parameters()).device
 
-    def forecast(part: slice) -> Tensor:
-        futures: Tensor = model.forecast(on_device_of(model, windows.past(part)), horizon, samples, **options)["x"]
-        return futures
+    def forecast(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {"x": model.forecast(Batch.from_leaves(inputs), horizon, samples, **options)["x"]}
 
     if cuda_graph and device.type != "cuda":
         warnings.warn(f"forecasts run without a CUDA graph: the device is {device.type}, not cuda", stacklevel=3)
-    if not cuda_graph or device.type != "cuda":
-        return forecast
-    captured = Captured("a forecast", device)
-
-    def record(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        with deferring() as checks:
-            futures = model.forecast(Batch.from_leaves(inputs), horizon, samples, **options)["x"]
-        return {"x": futures, "failed": any_failed(checks, device)}
-
-    def replay(part: slice) -> Tensor:
-        results = captured(None, record, on_device_of(model, windows.past(part)).leaves())
-        return forecast(part) if results["failed"] else results["x"]  # raises the error of the failed check
-
-    return replay
+    is_replayed = cuda_graph and device.type == "cuda"
+    run = partial(Captured("a forecast", device).checked, None, forecast) if is_replayed else forecast
+    return lambda part: run(on_device_of(model, windows.past(part)).leaves())["x"]
 
 
 def forecasts_of(name: str, forecaster: Forecaster, samples: int, windows: EvaluationWindows, part: slice) -> Tensor:

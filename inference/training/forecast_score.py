@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ...capture import Captured
 from ...data.batch import Batch
 from ...data.sequences import as_batches, mean_of_known, tensor_of
 from ...program.forecast import require_forecasts
@@ -46,7 +48,7 @@ def observed_steps(model: Any, windows: Any) -> int:
     return observed
 
 
-def forecast_score(model: Any, windows: Any, batch_size: int, seed: int) -> float:
+def forecast_score(model: Any, windows: Any, batch_size: int, seed: int, captured: Captured | None = None) -> float:
     """Return the mean CRPS of forecasts, without a unit; lower is better, infinite if a forecast is not finite.
 
     Each column is divided by its mean absolute change from one step to the next, over the observed part of the windows.
@@ -58,6 +60,7 @@ def forecast_score(model: Any, windows: Any, batch_size: int, seed: int) -> floa
         windows: validation windows, with `protocol.observed`.
         batch_size: number of windows to read at a time.
         seed: seed of the draws.
+        captured: CUDA graphs by which to replay the forecasts.
     """
     observed, data = observed_steps(model, windows), as_batches(windows)
     every, start, parts = math.ceil(len(data) / WINDOWS), 0, list[dict[str, Tensor]]()
@@ -69,10 +72,15 @@ def forecast_score(model: Any, windows: Any, batch_size: int, seed: int) -> floa
     values = selected.mask_to_nan().double().cpu()
     past, truth = values[:, :observed], values[:, observed:]
     is_drawn = model.is_drawn() if isinstance(model, Emitting) else True
+
+    def forecast(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        past = Batch.from_leaves(inputs)
+        return {"x": model.forecast(past, truth.shape[1], SAMPLES, draw_emission=is_drawn)["x"]}
+
+    run = forecast if captured is None else partial(captured.checked, NAME, forecast)
     with seeded_evaluation(model, seed):
-        inputs = on_device_of(model, selected.past(observed))
-        futures: Mapping[str, Tensor] = model.forecast(inputs, truth.shape[1], SAMPLES, draw_emission=is_drawn)
-    draws, scale = futures["x"].double().cpu(), scales(past)
+        draws = run(on_device_of(model, selected.past(observed)).leaves())["x"].double().cpu()
+    scale = scales(past)
     if not draws.isfinite().all():
         return math.inf
     return float(continuous_ranked_probability_score(draws.movedim(0, 1) / scale, truth / scale).mean())

@@ -41,7 +41,7 @@ class Training:
         devices: number of devices, with one process each; under torchrun, the number of processes on this host.
         precision: precision of the computation; "32-true" keeps the model's own.
         progress: whether to show a progress bar with the terms of the bound on the terminal.
-        cuda_graph: on a CUDA GPU, whether to replay steps and validation bounds as CUDA graphs (`dvae.capture`), one
+        cuda_graph: on a CUDA GPU, whether to replay steps and validations as CUDA graphs (`dvae.capture`), one
             for each shape of batch and each value of a curriculum; not with several devices. Attributes of the model,
             such as `feeding` or the mode of a part, must not change within a stage. It has only been tested on a
             simulated GPU.

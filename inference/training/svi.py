@@ -206,6 +206,7 @@ class SVI:
 
         If the option is set and there can be none, a warning says why.
         """
+        self._graphs_of = 0
         self.captured: Captured | None = None
         self.captured_validation: Captured | None = None
         if not self.training.cuda_graph:
@@ -242,7 +243,7 @@ class SVI:
             NonFiniteError: when the loss or a gradient is NaN or infinite; the weights do not change.
         """
         state, rates = self.state, self.rates(self.state.step)
-        stage = stage_at(self.plan, state.step)[1]
+        stage = self._enter_stage()
         if not self.model.training:
             self.module.train()
         converted = self._convert(batch)
@@ -250,6 +251,16 @@ class SVI:
         state.terms = take(converted, stage, rates)
         state.step += 1
         return state.terms
+
+    def _enter_stage(self) -> Stage:
+        """Return the stage of the next step; if it is a new one, drop the graphs of the last one."""
+        first, stage = stage_at(self.plan, self.state.step)
+        if first != self._graphs_of:
+            self._graphs_of = first
+            for captured in (self.captured, self.captured_validation):
+                if captured is not None:
+                    captured.clear()
+        return stage
 
     def _step(self, batch: Batch, stage: Stage, rates: Mapping[str, float]) -> Terms:
         """Take a step, and return the terms before it."""
@@ -324,9 +335,8 @@ class SVI:
         inputs = {"numbers": torch.tensor(numbers, dtype=torch.float64), **batch.leaves()}
         before = dict(self.random)
         with self.drawing():
-            kind = stage_at(self.plan, self.state.step)[0], *constant.items()
             function = partial(self._record, stage, constant, list(weights))
-            results = self.captured(kind, function, inputs)
+            results = self.captured(tuple(constant.items()), function, inputs)
         *verdict, _, _, is_invalid = results["numbers"].tolist()
         if is_invalid:
             self.random |= before
@@ -463,7 +473,9 @@ class SVI:
     def _forecast_score(self, windows: Any) -> float:
         """Return the score of forecasts, the same in all processes; infinite if they leave the range of numbers."""
         try:
-            score = forecast_score(self.model, windows, self.training.batch_size, self.training.seed)
+            score = forecast_score(
+                self.model, windows, self.training.batch_size, self.training.seed, self.captured_validation
+            )
         except (ValueError, RuntimeError) as error:
             if not _is_from_distribution(error) or isinstance(error, torch.cuda.OutOfMemoryError):
                 raise
@@ -543,7 +555,7 @@ class SVI:
             data: held-out data.
             feeding: probability of scheduled sampling; 0 to read the true past.
         """
-        number, stage = stage_at(self.plan, self.state.step)
+        stage = self._enter_stage()
         self.settle()
         sums, fabric = dict[str, Tensor](), self.fabric
         size = min(self.training.batch_size, math.ceil(len(data) / fabric.world_size))
@@ -558,12 +570,12 @@ class SVI:
             with self._drawing(random), torch.no_grad():  # other threads may run between two batches
                 if (batch := next(batches, None)) is None:
                     break
-                for name, value in self._held_out_sums(self._convert(batch), number, stage, feeding).items():
+                for name, value in self._held_out_sums(self._convert(batch), stage, feeding).items():
                     sums[name] = sums[name] + value if name in sums else value.clone()
         totals = self.total(torch.stack(list(sums.values())) * shares)
         return _per_step(dict(zip(sums, totals, strict=True)))
 
-    def _held_out_sums(self, batch: Batch, number: int, stage: Stage, feeding: float) -> Mapping[str, Tensor]:
+    def _held_out_sums(self, batch: Batch, stage: Stage, feeding: float) -> Mapping[str, Tensor]:
         """Return the sums of a held-out batch in a stage, by a CUDA graph if there is one for its kind."""
         objective, location = stage.objective, f"validation after step {self.state.step}"
 
@@ -575,20 +587,9 @@ class SVI:
                 values["loss"] = objective(terms, self.training.steps).double() * values["steps"]
             return values
 
-        def record(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            with deferring() as checks:
-                values = sums(Batch.from_leaves(inputs))
-            return {**values, "failed": any_failed(checks, self.fabric.device)}
-
         if self.captured_validation is None:
             return sums(batch)
-        before = self._random_state()
-        results = dict(self.captured_validation((number, feeding), record, batch.leaves()))
-        if results.pop("failed"):
-            with self._drawing(before):
-                sums(batch)  # the program itself raises the error of its check
-            raise RuntimeError(ONLY_WITHIN)
-        return results
+        return self.captured_validation.checked(feeding, lambda inputs: sums(Batch.from_leaves(inputs)), batch.leaves())
 
     def _convert(self, batch: AnyBatch) -> Batch:
         """Return a batch as tensors, in the precision of the model unless it is a `DynamicalVAE`, which converts."""

@@ -278,7 +278,8 @@ def steps_of(svi, recipe, count):
 @pytest.mark.parametrize("name", METHODS)
 def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
     """Draws are equal bit for bit, and terms up to rounding."""
-    count, runs = 12 if name == "mix-and-match" else 7, []  # a curriculum has a graph only once it is constant
+    # a curriculum has a graph only once it is constant, and motion-latent has two stages, with a graph each
+    count, runs = 12 if name in ("mix-and-match", "motion-latent") else 7, []
     for simulated in (False, True):
         model, recipe, train, _ = small_method(name, count)
         held_out = train.sample(3, torch.Generator().manual_seed(1))
@@ -434,6 +435,43 @@ class TestCapturedStep:
             svi = self.svi(True)
             assert [(svi.step(batch), svi.row()["loss"])[1] for batch in mixed] == pytest.approx(losses, 1e-6)
             assert len(svi.captured.graphs) == 2
+
+    def test_each_stage_has_its_graphs(self):
+        """Those of an earlier stage are dropped with their memory."""
+        stages = [dvae.Stage(steps, dvae.Evidence(kl_weight=w)) for steps, w in ((6, 0.1), (14, 2.0))]
+        stages[1] = replace(stages[1], frozen=("encoder.",))
+        runs, batches = [], self.batches(12)
+        for cuda_graph in (False, True):
+            with simulated_gpu() if cuda_graph else nullcontext():
+                svi = self.svi(cuda_graph, stages=stages)
+                rows = []
+                for step, batch in enumerate(batches):
+                    rows.append((svi.step(batch), svi.row()["loss"])[1])
+                    rows += [svi.evaluate(batches[0])["bound"] for _ in range(4)] if step in (4, 5, 11) else []
+                runs.append((rows, self.weights(svi)))
+        assert len(svi.captured.graphs) == len(svi.captured_validation.graphs) == 1
+        assert runs[1][0] == pytest.approx(runs[0][0], 1e-6)
+        torch.testing.assert_close(runs[1][1], runs[0][1], rtol=1e-6, atol=1e-6)
+
+    def test_forecasts_that_select_the_weights_are_replayed(self, monkeypatch):
+        windows, runs, replays = dvae.ArrayWindows(self.batches().flatten(0, 1)[:9], observed=2), [], []
+        replay = Tape.replay
+        monkeypatch.setattr(Tape, "replay", lambda tape: replays.append(replay(tape)))
+        for cuda_graph in (False, True):
+            with simulated_gpu() if cuda_graph else nullcontext():
+                svi = self.svi(cuda_graph, select="forecast")
+                runs.append([svi.validate(windows)["validation/CRPS"] for _ in range(WARM_UP + 2)])
+        assert runs[1] == pytest.approx(runs[0], 1e-9)
+        assert len(replays) == 2 * 2  # of the bound and the forecasts
+
+    def test_a_check_that_fails_in_a_replay_raises_its_error(self):
+        batches = self.batches()
+        with simulated_gpu():
+            svi = self.svi(True)
+            expected = [svi.evaluate(batches[0]) for _ in range(WARM_UP + 1)]
+            with pytest.raises(ValueError, match="x is NaN or infinite in 60 entries"):
+                svi.evaluate(torch.full_like(batches[0], torch.nan))
+            assert svi.evaluate(batches[0]) == pytest.approx(expected[0], 1e-9)
 
     def test_an_objective_without_weights_is_not_replayed(self):
         def objective(terms, step):
