@@ -1,7 +1,7 @@
 # make demo    simulated people: fit two methods, print the table, save demo/futures.png and demo/report.html
 # make test    lint, types, tests, and some of these once more as on another processor
 # make quick   lint, types, and the tests that are not slow
-# make studies   the scripts of the result pages on little data, the scores that are stored, and the longer notebooks
+# make studies   the longer notebooks, on a small share of their work
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make coverage   the tests, and which lines none of them runs
 # make gpu     on a machine with a GPU: its tests, and the speed of training steps; 10 minutes
@@ -66,7 +66,7 @@ test: venv
 	ATEN_CPU_CAPABILITY=default $(BIN)/pytest -n 2 --dist worksteal -m "not slow" -k "not beside_its_result" $(addprefix tests/,$(NUMERICAL))
 
 studies: venv
-	$(BIN)/pytest -n 2 --dist worksteal tests/studies
+	$(BIN)/pytest -n 2 --dist worksteal tests/studies/long
 
 SECONDS := 600
 SEED := $(shell date +%s)

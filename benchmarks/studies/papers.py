@@ -218,13 +218,14 @@ PATHED = ("ADE", "FDE", "energy score")
 
 @styled
 def draw_scores(rows_by_view: RowsByView, paper: Paper) -> Figure:
-    """Draw scores by number of given paths of rows with the presets' steps, over the seeds with all numbers.
+    """Draw scores by number of given paths of rows with as many steps as the first, over the seeds with all numbers.
 
     Intervals are over clips and seeds.
     """
-    figure = new_figure(7, 2.9)
+    figure, (first, *_) = new_figure(7, 2.9), paper.rows.values()
+    drawn = [row for row, options in paper.rows.items() if options.get("steps") == first.get("steps")]
     for panel, column in zip(figure.subplots(1, len(PATHED)), PATHED, strict=True):
-        for row in (NEIGHBOURS, *(row for row, options in paper.rows.items() if "steps" not in options)):
+        for row in (NEIGHBOURS, *drawn):
             entries_by_count = {view.given: rows[row] for view, rows in rows_by_view.items() if row in rows}
             common = min((len(entry.runs) for entry in entries_by_count.values()), default=0)
             estimates = {

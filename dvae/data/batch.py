@@ -110,11 +110,11 @@ class Batch(dict[str, Any]):
         """Return the batch with these tensors by path, the inverse of `leaves`."""
         batch = cls()
         for path, value in leaves.items():
-            name, _, inner = path.partition("/")
-            if inner:
-                batch.setdefault(name, {})[inner] = value
-            else:
-                batch[name] = value
+            *names, last = path.split("/")
+            part: dict[str, Any] = batch
+            for name in names:
+                part = part.setdefault(name, {})
+            part[last] = value
         return batch
 
     def __setitem__(self, name: str, value: Any) -> None:

@@ -31,6 +31,14 @@ def test_attributes_are_entries_that_are_no_variables(is_dict):
     assert not plain.partial
 
 
+def test_a_batch_is_restored_from_its_leaves():
+    batch = Batch(x=X, motion={"x": X + 1, "view_inputs": {"turns": X + 2}})
+    assert [*batch.leaves()] == ["x", "motion/x", "motion/view_inputs/turns"]
+    restored = Batch.from_leaves(batch.leaves())
+    assert restored["motion"].keys() == {"x", "view_inputs"}
+    assert torch.equal(restored["motion"]["view_inputs"]["turns"], X + 2)
+
+
 def test_rows_of_a_batch_are_a_batch_with_these_rows_of_every_tensor():
     batch = Batch(x=X, mask={"x": X > 3}, view_inputs={"turns": X})
     for part in (slice(1, 3), [1, 2], torch.tensor([1, 2])):

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.studies import notebooks
 
-NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted((Path(__file__).parents[3] / "notebooks").glob("*.ipynb"))
 
 
 @pytest.fixture(scope="module")
