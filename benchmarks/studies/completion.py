@@ -12,7 +12,8 @@ processes may work on other parts or runs at once. Tables show the available fil
 Residual-sup (Martinez et al. 2017, arXiv 1705.02445) is the network of mix-and-match without noise that adds velocities
 to poses, on quaternions and places, fitted to the takes of the same training segments on the same body. The part
 "claim" predicts as in the paper, with runs fitted on file group A only (`--tuned`) and residual-sup at 100 frames per
-second. The takes have 2 % more frames than the segments of group A, so the data are nearly equal.
+second; as in the paper, residual-sup knows the true body, and ours infers it. The takes have 2 % more frames than the
+segments of group A, so the data are nearly equal.
 """
 
 from __future__ import annotations
@@ -463,9 +464,9 @@ def claim_rows(out: Path) -> dict[str, Row]:
     measured = {path.name: path for path in sorted((out / CLAIM).glob("*")) if path.is_dir()}
     cases = dict.fromkeys(name.rpartition("-")[0] for name in measured if (measured[name] / "prediction.json").exists())
     rows: dict[str, Row] = {}
-    for case, shown in itertools.product(cases, (OURS, NEAR)):
+    for case, shown in itertools.product(cases, (BODY_UNKNOWN, OURS, NEAR)):
         files = [measured[name] / "prediction.json" for name in measured if name.rpartition("-")[0] == case]
-        label = case if shown == OURS else f"{case}, {NEAR}"
+        label = {OURS: f"{case}, body given", BODY_UNKNOWN: case}.get(shown, f"{case}, {NEAR}")
         rows[label] = Row([json.loads(file.read_text()) for file in files if file.exists()], shown)
     references = read_all(out / CLAIM, "references")
     return rows | ({} if references is None else {name: replace(references, name=name) for name in (SUP, STILL)})
@@ -628,7 +629,7 @@ def main(
     Args:
         data: motion file (bandai2.npz), required for new measurements.
         runs: directories of fitted runs, one per seed; the study fits as many of residual-sup.
-        tuned: directories of runs fitted on file group A, named CASE-SEED.
+        tuned: directories of runs fitted on file group A by `benchmarks.studies.motion_latent`: SECTION/CASE-SEED.
         out: directory of the measurements, in a folder per run.
         results: folder of the tables, such as benchmarks/results; None prints them.
         picture: file of the picture of errors over time and completions, drawn if `results` is given.
@@ -652,7 +653,8 @@ def main(
             )
     for path in tuned if CLAIM in parts else ():
         run, seed = EvaluatedRun(path, data, budget, grouped=True), int(path.name.rpartition("-")[2])
-        read_or_measure(out / CLAIM / path.name / "prediction.json", partial(measure_prediction, run))
+        here = out / CLAIM / f"{path.parent.name}-{path.name}"
+        read_or_measure(here / "prediction.json", partial(measure_prediction, run))
         sup = out / CLAIM / f"{SUP}-{seed}"
         read_or_measure(sup / "references.json", partial(measure_references, run, seed, sup, PUBLISHED_FPS))
     if tuned and "tuning" in parts:

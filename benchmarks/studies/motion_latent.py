@@ -44,6 +44,8 @@ DRAWN = 500
 FULL, FIRST, SHAPED = "both phases", "first phase alone", "guide with beta"
 CASES = settings(__file__)
 SECTIONS = {TUNING: CASES["named"] | CASES["tried"], HELD_OUT: CASES["named"], PRIOR: CASES["prior"]}
+LENGTHS = {TUNING: 1500, HELD_OUT: 2000, PRIOR: 1500}
+"""Number of training steps by section."""
 
 
 @cache
@@ -114,7 +116,10 @@ def run(section: str, file: Path, other: Path | None, steps: int, case: str, see
     options = SECTIONS[section][case]
     data = segments(section, file, **options.get("data", {}))
     train, method = data.windows("train"), dvae.method("motion-latent", **options.get("method", {}))
-    fit = fit_or_load(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **TRAINING)
+    training = dict(TRAINING)
+    if method.published:
+        training |= {name: getattr(method.training(data), name) for name in ("batch_size", "gradient_clip")}
+    fit = fit_or_load(method, data, train, data.windows("validation"), out=out, seed=seed, steps=steps, **training)
     tests = {SAME: data.windows("test")}
     if other is not None and section == HELD_OUT:
         tests[OTHER] = other_source(other, data.timed)
@@ -186,18 +191,19 @@ def prior_table(cases: Mapping[str, Row]) -> Table:
     return tabled(rows, {name: partial(cell, name=name) for name in names})
 
 
-def tables(section: str, cases: Mapping[str, Row]) -> dict[str, Table]:
-    """Return a section's two tables for each test set; interpolations are scored on the first only."""
+def tables(title: str, cases: Mapping[str, Row]) -> dict[str, Table]:
+    """Return two tables of a section for each test set; interpolations are scored on the first only."""
     first, available = next(iter(cases.values())).runs[0], {}
     for test in first["tests"]:
         takes, rows = first[test]["clips"], {name: row.of(test) for name, row in cases.items()}
         costs = budget(cases.values(), first["steps"])
         note = f"{len(takes)} segments of {len({*takes})} takes. {costs}"
-        name = f"motion_latent_4d/{folder(section)}-{folder(test)}"
+        name = f"motion_latent_4d/{folder(title)}-{folder(test)}"
         available[name] = tabled(rows, SCORED | (INTERPOLATED if test == SAME else {}), note=note)
-        available[f"{name}-differences"] = difference_table(rows)
+        if (differences := difference_table(rows)).rows:
+            available[f"{name}-differences"] = differences
     if any("generated" in run for row in cases.values() for run in row.runs):
-        available[f"motion_latent_4d/{folder(section)}-generated"] = prior_table(cases)
+        available[f"motion_latent_4d/{folder(title)}-generated"] = prior_table(cases)
     return available
 
 
@@ -209,7 +215,7 @@ def main(
     sections: tuple[str, ...] = tuple(SECTIONS),
     cases: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (0, 1, 2),
-    steps: int = 2000,
+    steps: int | None = None,
 ) -> None:
     """Fit, score, and write the tables.
 
@@ -221,15 +227,17 @@ def main(
         sections: sections to fit.
         cases: names of cases to fit; all cases of a section if empty.
         seeds: seeds of the runs to fit.
-        steps: number of training steps.
+        steps: other number of training steps of the sections, which the names of runs and tables then contain.
     """
     torch.set_num_threads(1)
-    for section in sections if data else ():
-        measure(runs / folder(section), cases or SECTIONS[section], seeds, partial(run, section, data, other, steps))
-    rows_by_section = {name: rows_of(runs / folder(name), name) for name in SECTIONS}
-    for name, rows in rows_by_section.items():
-        if rows:
-            write(results, tables(name, rows))
+    for section, length in LENGTHS.items():
+        other_length = section if steps in (None, length) else f"{section}, {steps} steps"
+        if data is not None and section in sections:
+            fit = partial(run, section, data, other, steps or length)
+            measure(runs / folder(other_length), cases or SECTIONS[section], seeds, fit)
+        for title in dict.fromkeys([section, other_length]):
+            if rows := rows_of(runs / folder(title), section):
+                write(results, tables(title, rows))
 
 
 if __name__ == "__main__":

@@ -97,7 +97,9 @@ class Glimpse:
         if self.frames is not None and (self.seconds, self.fps) != (None, None):
             raise ValueError("--frames is for unknown times, --seconds and --fps are for known times; give only one")
 
-    def of(self, model: Any, truth: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tensor]:
+    def of(
+        self, model: Any, truth: Mapping[str, torch.Tensor], markers: Sequence[int], seed: int
+    ) -> dict[str, torch.Tensor]:
         """Return simulated observations of segments, given their x (B, N, D) and beta (B, S)."""
         if self.seen is None:
             raise UsageError("--from requires --seen surfaces, points or markers")
@@ -114,6 +116,7 @@ class Glimpse:
                 )
             frames = np.linspace(0, model.timed.frames - 1, self.frames).round().tolist()
         options: dict[str, Any] = {"seconds": self.seconds, "frames": frames, "points": self.points, "gaps": self.gaps}
+        options["markers"] = markers
         observations = simulate_observations(model, x, shape, self.seen, fps=self.fps or 30.0, seed=seed, **options)
         return observations | ({SHAPE: shape} if self.known_body else {})
 
@@ -130,6 +133,7 @@ class Recovery:
         file: npz file of your own observations, instead of simulated ones.
         aggregate: use a normal distribution fitted to the latents of known segments as prior of z, instead of N(0, I).
         two_way: for points: vertices far from all points are errors, too, as in a two-way Chamfer distance.
+        markers: vertices of the body on which the markers are; those of the default body if empty.
     """
 
     glimpse: Glimpse = Glimpse()
@@ -139,6 +143,7 @@ class Recovery:
     file: Path | None = None
     aggregate: Expert[bool] = True
     two_way: Expert[bool] = False
+    markers: Annotated[Expert[tuple[int, ...]], tyro.conf.arg(name="marker-vertices")] = ()
 
     def run(self, run: Path, out: Path | None, draws: int, seed: int, data: str | None, use: Use) -> None:
         """Recover segments, print the estimates with their uncertainty, and write them."""
@@ -160,9 +165,9 @@ class Recovery:
             if len({*keys}) < len(keys):
                 raise UsageError(f"--from {' '.join(self.source)} names a segment twice")
             truth = {name: torch.cat([segments.all()[name] for segments in selected]) for name in (WHOLE, SHAPE)}
-            seen = self.glimpse.of(model, truth, seed)
+            seen = self.glimpse.of(model, truth, self.markers, seed)
         else:
-            seen, data_set = read_seen(self.file, model), _known_data(loaded, data)
+            seen, data_set = read_seen(self.file, model, self.markers), _known_data(loaded, data)
             keys = [("seen", f"segment-{n:02d}") for n in range(len(next(iter(seen.values()))))]
         if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
             raise UsageError(
@@ -172,6 +177,7 @@ class Recovery:
         training_segments = None if data_set is None else _other_segments(data_set, takes)
         options: dict[str, Any] = {"truth": truth, "deviations": self.deviations, "known": training_segments}
         options |= {"descent": self.descent, "aggregate": self.aggregate, "two_way": self.two_way}
+        options["markers"] = self.markers
         recovered = recover_segments(model, seen, keys, **options, seed=seed, progress=True)
         for warning in _warnings(recovered, self.deviations):
             note(warning)

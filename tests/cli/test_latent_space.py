@@ -154,6 +154,18 @@ def test_observations_in_a_file_need_no_training_data(capsys, folder, loaded_run
     assert table.split("seen/segment-00 │ ")[1].split(" │ ")[0] in expected
 
 
+def test_markers_can_be_on_any_vertices(capsys, folder, loaded_run, tmp_path):
+    np.savez(tmp_path / "seen.npz", **observations(loaded_run, fps=10.0, markers=(0, 5, 9)))
+    name = loaded_run.data.windows("test").motion.clips[0].name
+    on = ["--marker-vertices", 0, 5, 9]
+    table, _ = impute(capsys, folder, "--file", tmp_path / "seen.npz", *on)
+    simulated, _ = impute(capsys, folder, "--from", f"test/{name}", "--seen", "markers", "--fps", "10", *on)
+    assert table.split("seen/segment-00 │ ")[1].split(" │ ")[0] in simulated
+    wrong = ["impute", str(folder / "run"), "--file", str(tmp_path / "seen.npz")]
+    assert "expected (2, " in failure(capsys, *wrong)
+    assert "marker vertex 999999 does not exist" in failure(capsys, *wrong, "--marker-vertices", "0", "5", "999999")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -291,7 +291,8 @@ def test_motion_latent(tmp_path, out, monkeypatch):
             options = {"widths": (8,), **case.get("method", {})}
             small = {**options, "latent": options.get("latent", 64) // 16}
             monkeypatch.setitem(cases, name, {**case, "method": small})
-    options = {"runs": tmp_path / "runs", "results": out, "steps": 3}
+    monkeypatch.setattr(motion_latent, "LENGTHS", dict.fromkeys(motion_latent.LENGTHS, 3))
+    options = {"runs": tmp_path / "runs", "results": out}
     data = {"data": tmp_path / "people.npz", "other": tmp_path / "people.npz"}
     main, tuning = motion_latent.main, ("both phases", "turns scaled", "z of 16")
     main(**data, sections=("held out",), cases=("both phases", "first phase alone"), seeds=(0, 1), **options)
@@ -311,6 +312,11 @@ def test_motion_latent(tmp_path, out, monkeypatch):
     names = ["KL 1, N(0, I)", "KL 1, fitted normal", "KL 1, aggregate posterior"]
     assert [row[0] for row in generated[1:]] == [*names, "real, training", "real, test"]
     assert [row[-1] == "–" for row in generated[1:]] == [False] * 3 + [True] * 2  # only models have latents
+    main(**data, sections=("prior",), cases=("published",), seeds=(0,), **options, steps=4)
+    (longer,) = tables(out, "motion_latent_4d/prior-4-steps-same-source")
+    assert [row[0] for row in longer[1:]] == ["published", "PCA of 12"]
+    training = Run(tmp_path / "runs" / "prior-4-steps" / "published-0").config["training"]
+    assert (training["batch_size"], training["gradient_clip"]) == (256, None)
 
 
 def test_completion(tmp_path, out, short, monkeypatch):
@@ -340,16 +346,17 @@ def test_completion(tmp_path, out, short, monkeypatch):
     assert (tmp_path / "a.png").stat().st_size > 10_000
     monkeypatch.setattr(completion, "TUNED_DEVIATIONS", {"surface": (0.01,), "marker": (), "point": ()})
     monkeypatch.setattr(completion, "DESCENTS", [])
-    shutil.copytree(tmp_path / "a", tmp_path / "KL-1-0")
-    completion.main("simulated", (), (tmp_path / "KL-1-0",), parts=("tuning", "claim"), **options)
+    shutil.copytree(tmp_path / "a", tmp_path / "prior" / "KL-1-0")
+    completion.main("simulated", (), (tmp_path / "prior" / "KL-1-0",), parts=("tuning", "claim"), **options)
     assert len([*(tmp_path / "out" / completion.TUNING).glob("*.json")]) == 2
     (claimed,) = tables(out, "motion_latent_4d/prediction-claim")
     names = (
-        "KL-1",
-        "KL-1, reconstruction",
+        "prior-KL-1",
+        "prior-KL-1, body given",
+        "prior-KL-1, reconstruction",
         "residual-sup",
         "last frame held",
-        "KL-1 minus residual-sup, 95 %",
+        "prior-KL-1 minus residual-sup, 95 %",
         "segments",
     )
     assert [row[0] for row in claimed[1:]] == [*names]

@@ -385,7 +385,7 @@ def complete(
     Raises:
         ValueError: same as `SegmentCompletion.read`.
     """
-    spots = markers or tuple(MARKERS.values())
+    spots = tuple(markers or MARKERS.values())
     program = SegmentCompletion(model, deviations or Deviations(), spots, known, aggregate, two_way)
     data, guide = program.read(observations), None if known is None else program.guide
     options: dict[str, Any] = {"descent": descent, "seed": seed, "chunk": chunk, "progress": progress}
@@ -405,7 +405,7 @@ def simulate_observations(
     frames: Sequence[int] | None = None,
     points: int = 50,
     gaps: float = 0.0,
-    markers: Sequence[int] = tuple(MARKERS.values()),
+    markers: Sequence[int] | None = None,
     seed: int = 0,
 ) -> dict[str, Tensor]:
     """Return simulated observations of known segments, to evaluate their completion.
@@ -420,7 +420,7 @@ def simulate_observations(
             ignored.
         points: number of points M per moment, drawn uniformly from the surface.
         gaps: fraction of points or markers that are missing.
-        markers: (L,), vertex index of each marker.
+        markers: (L,), vertex index of each marker; default: `bodies.MARKERS`.
         seed: seed of points and gaps.
 
     Returns:
@@ -440,8 +440,9 @@ def simulate_observations(
         observations = {FRAMES: torch.tensor(frames).to(x).expand(len(x), -1)}
     rotations, places = model.timed.poses(_at_moments(model.timed, x, observations)[0])
     if kind == SPOTS:
-        _check_markers(model.body, markers)
-        positions = model.body.select_vertices(shape, rotations, places, torch.tensor(markers))
+        vertices = tuple(markers or MARKERS.values())
+        _check_markers(model.body, vertices)
+        positions = model.body.select_vertices(shape, rotations, places, torch.tensor(vertices))
     else:
         positions = model.body(shape, rotations, places)[0]
         if kind == POINTS:
@@ -452,10 +453,15 @@ def simulate_observations(
 
 
 def _check_markers(body: Body, markers: Sequence[int]) -> None:
-    """Raise an error if the markers are the default ones, which are vertices of the bundled person, on another body."""
+    """Raise an error if the markers are no vertices of the body, or those of the bundled person on another body."""
     if tuple(markers) == tuple(MARKERS.values()) and is_from_file(body):
         raise ValueError(
-            "the default markers are vertices of the bundled person; give the vertices of this body as `markers`"
+            "the default markers are vertices of the bundled person; give the vertices of this body as `markers` "
+            "(`--marker-vertices`)"
+        )
+    if wrong := [vertex for vertex in markers if not 0 <= vertex < len(body.template)]:
+        raise ValueError(
+            f"marker vertex {wrong[0]} does not exist; the body has vertices 0 to {len(body.template) - 1}"
         )
 
 

@@ -164,6 +164,7 @@ def recover(
     *,
     truth: Mapping[str, Any] | None = None,
     deviations: Deviations | None = None,
+    markers: Sequence[int] | None = None,
     known: Mapping[str, Any] | None = None,
     aggregate: bool = True,
     two_way: bool = False,
@@ -174,7 +175,7 @@ def recover(
     """Complete segments, and evaluate the results.
 
     Args:
-        model, observations, deviations, known, aggregate, two_way, descent, seed, progress: same as in `complete`.
+        model, observations, deviations, markers, known, aggregate, two_way, descent, seed, progress: as in `complete`.
         keys: (split, name) of each segment.
         truth: true x (B, N, D) and beta (B, S), if known.
 
@@ -185,9 +186,9 @@ def recover(
     Raises:
         ValueError: same as `complete`; or a segment has no observations.
     """
-    _check_nonempty(SegmentCompletion(model).read(observations))
+    _check_nonempty(_completion(model, markers).read(observations))
     options: dict[str, Any] = {"deviations": deviations, "known": known, "aggregate": aggregate, "descent": descent}
-    options["two_way"] = two_way
+    options |= {"two_way": two_way, "markers": markers}
     completed = complete(model, observations, **options, seed=seed, progress=progress)
     bound = completed.evidence(DRAWS, seed=seed, chunk=AT_ONCE)
     distances = completed.program.distances(completed.observations, completed.posterior.mode[LATENT], completed.shape)
@@ -195,13 +196,17 @@ def recover(
     return Recovered(completed, keys, completed.draw(DRAWS, seed), bound.khat, distances, true)
 
 
-def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
+def _completion(model: Any, markers: Sequence[int] | None) -> SegmentCompletion:
+    return SegmentCompletion(model, **({"markers": tuple(markers)} if markers else {}))
+
+
+def read_seen(path: str | Path, model: Any, markers: Sequence[int] | None = None) -> dict[str, Tensor]:
     """Read observations of segments from a file.
 
     Args:
         path: npz file with arrays that have the names and shapes in `completion`: times or frames; some of surfaces,
             points and markers; and beta if known. Arrays of a single segment may omit the first axis.
-        model: model of segments, as in `SegmentCompletion`.
+        model, markers: as in `SegmentCompletion`.
 
     Returns:
         Observations for `recover`, in double precision.
@@ -220,7 +225,7 @@ def read_seen(path: str | Path, model: Any) -> dict[str, Tensor]:
             observations = {name: value[None] for name, value in observations.items()}
         for name, value in observations.items():
             _check_numbers(name, value)
-        _check_nonempty(SegmentCompletion(model).read(observations))
+        _check_nonempty(_completion(model, markers).read(observations))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return observations

@@ -155,6 +155,9 @@ def test_a_run_names_its_body_and_reopens_it(folder, capsys, tmp_path):
     assert main(["evaluate", str(out)]) == 0
     with pytest.raises(ValueError, match="default markers are vertices of the bundled person"):
         simulate_observations(run.model, test.all()["x"], test.all()["beta"], "markers")
+    name = next(clip.name for clip in test.motion)
+    marked = ["impute", str(out), "--from", f"test/{name}", "--seen", "markers", "--frames", "4", "--steps", "2"]
+    assert main([*marked, "--marker-vertices", "0", "5", "9", "--out", str(tmp_path / "whole.npz")]) == 0
     other = run.with_data(folder / "amass" / "CMU")  # no source of it was held out
     assert {*other.motion.splits} == {"train", "test"}
 
