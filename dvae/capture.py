@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -33,6 +33,7 @@ PROTOTYPE = "Synchronization debug mode is a prototype"
 
 _CHECKS: ContextVar[list[Tensor] | None] = ContextVar("checks", default=None)
 Function = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
+Tensors = TypeVar("Tensors", bound=Any)
 
 
 @contextmanager
@@ -73,7 +74,8 @@ class Captured:
 
     The first calls of a kind run the function itself. The last of them count what a graph cannot repeat: reads of the
     GPU's values, uploads of other tensors and random numbers of the CPU. If there are any, calls of this kind always
-    run the function, and a warning gives the reasons once.
+    run the function, and a warning gives the reasons once. So do calls whose recording fails, for example because a
+    library synchronises.
 
     Args:
         name: name of the functions, for warnings and errors.
@@ -87,6 +89,8 @@ class Captured:
         self.obstacles = dict[Hashable, list[str]]()
         self.graphs = dict[Hashable, _Graph]()
         self._stream: Any = torch.cuda.Stream(device)
+        # one for all graphs, because the results of a call are read before the next one
+        self._pool: Any = torch.cuda.graph_pool_handle()
         self._calls = Counter[Hashable]()
 
     def __call__(self, kind: Hashable, function: Function, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -98,8 +102,6 @@ class Captured:
                 nothing else that changes, except parameters and buffers, which it may change in place.
             inputs: tensors by name, on the CPU or the GPU.
 
-        Raises:
-            RuntimeError: the function cannot be recorded, for a reason that its first calls have not shown.
         """
         kind = (kind, *((name, value.shape, value.dtype) for name, value in inputs.items()))
         if kind in self.graphs:
@@ -116,7 +118,14 @@ class Captured:
             self._warn(f"there are {MOST_GRAPHS} graphs for other shapes already")
             self.obstacles[kind] = []
             return function(device_inputs)
-        self.graphs[kind] = self._record(function, device_inputs)
+        try:
+            self.graphs[kind] = self._record(function, device_inputs)
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            self._warn(f"the recording failed: {error.__context__ or error}")
+            self.obstacles[kind] = [str(error)]
+            return function(device_inputs)
         return self.graphs[kind].replay(inputs)
 
     def checked(self, kind: Hashable, function: Function, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -154,16 +163,12 @@ class Captured:
             # other threads may use the GPU meanwhile
             with (
                 _Reads() as reads,
-                torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
+                torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"),
             ):
                 results = function(memory)
-        except RuntimeError as error:
-            torch.cuda.set_stream(current)  # torch does not leave the stream of a recording that fails
-            raise RuntimeError(
-                f"{self.name} cannot be recorded as a CUDA graph: {error.__context__ or error}; set cuda_graph=False"
-            ) from error
         finally:
             self.recording = False
+            torch.cuda.set_stream(current)  # torch does not leave the stream of a recording that fails
         return _Graph(graph, memory, results, [*reads.tensors.values()])
 
     def _warm_up(self, kind: Hashable, function: Function, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -192,6 +197,23 @@ class Captured:
         """Warn of the first kind without a graph."""
         if not self.obstacles:
             warnings.warn(f"{self.name} runs without a CUDA graph: {reasons}", stacklevel=5)
+
+
+def replayed(
+    captured: Captured | None, kind: Hashable, function: Callable[[Tensors], dict[str, Tensor]]
+) -> Callable[[Tensors], dict[str, Tensor]]:
+    """Return a function of a batch, replayed as a CUDA graph unless `captured` is None.
+
+    Args:
+        captured: the graphs.
+        kind: as in `Captured`.
+        function: function from a batch on the GPU to results, which may call `defer`.
+    """
+    if captured is None:
+        return function
+    return lambda batch: captured.checked(
+        kind, lambda inputs: function(type(batch).from_leaves(inputs)), batch.leaves()
+    )
 
 
 class _Graph:

@@ -247,9 +247,9 @@ class _Moves(TorchFunctionMode):
             return cast
         if is_on_device:
             self.traffic.note(self.traffic.uploads, "to")
-            return OnDevice(cast.detach(), value.requires_grad)
+            return OnDevice(cast.detach().clone(), value.requires_grad)
         self.traffic.note(self.traffic.reads, "to")
-        return cast.own  # type: ignore[attr-defined, no-any-return]
+        return cast.own.clone()  # type: ignore[attr-defined, no-any-return]
 
 
 def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
@@ -299,7 +299,7 @@ def on_device() -> Iterator[Traffic]:
         traffic = stack.enter_context(Traffic())
 
         @contextmanager
-        def graph(tape: Tape, **_: Any) -> Iterator[None]:
+        def graph(tape: Tape, *_: Any, **__: Any) -> Iterator[None]:
             traffic.tape, random_state = tape, torch.get_rng_state()
             try:
                 yield
@@ -316,6 +316,7 @@ def on_device() -> Iterator[Traffic]:
             "current_stream": stream,
             "set_stream": stream,
             "graph": graph,
+            "graph_pool_handle": lambda: None,
             "set_sync_debug_mode": traffic.set_sync_debug_mode,
             "get_sync_debug_mode": lambda: traffic.sync_debug_mode,
         }

@@ -15,7 +15,6 @@ import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from reprlib import repr as brief
 from typing import Any
 
@@ -23,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...capture import Captured
+from ...capture import Captured, replayed
 from ...data.batch import Batch
 from ...data.sequences import HeldOutWindows, axis_names
 from ...options import Count, Delay, require
@@ -90,8 +89,8 @@ def evaluate(
         options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at the mean of the
             prior.
         progress: whether to show a progress bar.
-        cuda_graph: on a CUDA GPU, whether to replay forecasts as CUDA graphs (`dvae.capture`). It has only been tested
-            on a simulated GPU.
+        cuda_graph: on a CUDA GPU, whether to replay forecasts and the ELBO as CUDA graphs (`dvae.capture`). It has only
+            been tested on a simulated GPU.
 
     Returns:
         The evaluation; print it, or use its `table`, `plot` and `to_json`.
@@ -149,11 +148,12 @@ def evaluate(
         for name, each in models.items():
             with seeded_evaluation(each, seed):
                 forecast_options = {"draw_emission": is_drawn[name], **(options or {})}
-                forecaster = forecaster_of(each, eval_windows, samples, forecast_options, cuda_graph)
+                graphs = _graphs_of(name, each) if cuda_graph else None
+                forecaster = forecaster_of(each, eval_windows, samples, forecast_options, graphs)
                 cluster_scores, histograms = evaluator.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with seeded_evaluation(each, seed):
-                    cluster_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"))
+                    cluster_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"), graphs)
             if each.likelihood or has_ode(each):
                 with seeded_evaluation(each, seed):
                     cluster_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"))
@@ -298,18 +298,24 @@ class _Evaluator:
         )
         return scores, histograms
 
-    def bounds(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
+    def bounds(self, name: str, model: Any, parts: Iterator[slice], graphs: Captured | None) -> dict[str, np.ndarray]:
         """Return bounds, KL terms and k-hat by name, in nats per step, for each cluster."""
         results, weighted = [], self.bound_particles > 0 and not getattr(model, "bounded", ())
         elbo = SequenceELBO(1 if weighted else max(self.bound_particles, 1))
+
+        def terms_of(batch: Batch) -> dict[str, Tensor]:
+            terms = elbo.terms(model, batch)
+            kl = {f"KL {latent}": kl / terms.n_steps for latent, kl in terms.kl.items()}
+            return {"ELBO": terms.per_step, **kl, "steps": terms.n_steps}
+
+        run = replayed(graphs, "bound", terms_of)
         for part in parts:
             batch = on_device_of(model, self.eval_windows.part(part))
-            terms = elbo.terms(model, batch)
-            scores = {"ELBO": terms.per_step}
-            scores |= {f"KL {latent}": kl / terms.n_steps for latent, kl in terms.kl.items()}
+            scores = dict(run(batch))
+            steps = scores.pop("steps")
             if weighted:
                 iwae = iwae_bound(model, batch, particles=self.bound_particles)
-                scores |= {"IWAE bound": iwae.bound / terms.n_steps, "k-hat": iwae.khat}
+                scores |= {"IWAE bound": iwae.bound / steps, "k-hat": iwae.khat}
             refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.eval_windows.keys[part])
             results.append({metric: values.cpu() for metric, values in scores.items()})
         return self._means(_concatenate(results))
@@ -356,8 +362,21 @@ def _references(
     return truths | {name: available[name] for name in requested}
 
 
+def _graphs_of(name: str, model: nn.Module) -> Captured | None:
+    """Return CUDA graphs for a model on a GPU; warn if it is elsewhere."""
+    device = next(model.parameters()).device
+    if device.type == "cuda":
+        return Captured(f"the evaluation of {name}", device)
+    warnings.warn(f"{name} is evaluated without CUDA graphs: the device is {device.type}, not cuda", stacklevel=3)
+    return None
+
+
 def forecaster_of(
-    model: Any, windows: EvaluationWindows, samples: int, options: Mapping[str, Any], cuda_graph: bool = False
+    model: Any,
+    windows: EvaluationWindows,
+    samples: int,
+    options: Mapping[str, Any],
+    graphs: Captured | None = None,
 ) -> Forecaster:
     """Return a function that forecasts futures (K, B, H, D) of a slice of windows.
 
@@ -366,18 +385,14 @@ def forecaster_of(
         windows: windows to forecast.
         samples: K, number of futures per window.
         options: further arguments of the model's `forecast`.
-        cuda_graph: on a CUDA GPU, whether to replay forecasts as CUDA graphs.
+        graphs: CUDA graphs by which to replay the forecasts.
     """
-    horizon, device = windows.futures.shape[1], next(model.parameters()).device
 
-    def forecast(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {"x": model.forecast(Batch.from_leaves(inputs), horizon, samples, **options)["x"]}
+    def forecast(batch: Batch) -> dict[str, Tensor]:
+        return {"x": model.forecast(batch, windows.futures.shape[1], samples, **options)["x"]}
 
-    if cuda_graph and device.type != "cuda":
-        warnings.warn(f"forecasts run without a CUDA graph: the device is {device.type}, not cuda", stacklevel=3)
-    is_replayed = cuda_graph and device.type == "cuda"
-    run = partial(Captured("a forecast", device).checked, None, forecast) if is_replayed else forecast
-    return lambda part: run(on_device_of(model, windows.past(part)).leaves())["x"]
+    run = replayed(graphs, "forecast", forecast)
+    return lambda part: run(on_device_of(model, windows.past(part)))["x"]
 
 
 def forecasts_of(name: str, forecaster: Forecaster, samples: int, windows: EvaluationWindows, part: slice) -> Tensor:

@@ -6,14 +6,12 @@ A bound scores one step at a time, given the true past. A model with a better bo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ...capture import Captured
+from ...capture import Captured, replayed
 from ...data.batch import Batch
 from ...data.sequences import as_batches, mean_of_known, tensor_of
 from ...program.forecast import require_forecasts
@@ -73,13 +71,12 @@ def forecast_score(model: Any, windows: Any, batch_size: int, seed: int, capture
     past, truth = values[:, :observed], values[:, observed:]
     is_drawn = model.is_drawn() if isinstance(model, Emitting) else True
 
-    def forecast(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        past = Batch.from_leaves(inputs)
-        return {"x": model.forecast(past, truth.shape[1], SAMPLES, draw_emission=is_drawn)["x"]}
+    def forecast(batch: Batch) -> dict[str, Tensor]:
+        return {"x": model.forecast(batch, truth.shape[1], SAMPLES, draw_emission=is_drawn)["x"]}
 
-    run = forecast if captured is None else partial(captured.checked, NAME, forecast)
     with seeded_evaluation(model, seed):
-        draws = run(on_device_of(model, selected.past(observed)).leaves())["x"].double().cpu()
+        futures = replayed(captured, NAME, forecast)(on_device_of(model, selected.past(observed)))["x"]
+    draws = futures.double().cpu()
     scale = scales(past)
     if not draws.isfinite().all():
         return math.inf

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ...capture import Captured, any_failed, deferring
+from ...capture import Captured, any_failed, deferring, replayed
 from ...data.batch import Batch
 from ...data.sequences import Batched, as_batches, refuse_table, tensor_of
 from ...locking import no_fork, seeded, serialized
@@ -587,9 +587,7 @@ class SVI:
                 values["loss"] = objective(terms, self.training.steps).double() * values["steps"]
             return values
 
-        if self.captured_validation is None:
-            return sums(batch)
-        return self.captured_validation.checked(feeding, lambda inputs: sums(Batch.from_leaves(inputs)), batch.leaves())
+        return replayed(self.captured_validation, feeding, sums)(batch)
 
     def _convert(self, batch: AnyBatch) -> Batch:
         """Return a batch as tensors, in the precision of the model unless it is a `DynamicalVAE`, which converts."""

@@ -197,7 +197,7 @@ def recover(
 
 
 def _completion(model: Any, markers: Sequence[int] | None) -> SegmentCompletion:
-    return SegmentCompletion(model, **({"markers": tuple(markers)} if markers else {}))
+    return SegmentCompletion(model, markers=tuple(markers)) if markers else SegmentCompletion(model)
 
 
 def read_seen(path: str | Path, model: Any, markers: Sequence[int] | None = None) -> dict[str, Tensor]:
