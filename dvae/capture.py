@@ -101,7 +101,6 @@ class Captured:
             function: function from a dictionary of tensors on the GPU to another. Within a kind, it may depend on
                 nothing else that changes, except parameters and buffers, which it may change in place.
             inputs: tensors by name, on the CPU or the GPU.
-
         """
         kind = (kind, *((name, value.shape, value.dtype) for name, value in inputs.items()))
         if kind in self.graphs:

@@ -16,7 +16,7 @@ from .. import motion
 from ..data.batch import WHOLE
 from ..inference.diagnostics.posteriors import Descent
 from ..inference.training.checkpoints import CheckpointError
-from ..motion.segments.completion import TO_POINTS, Deviations, simulate_observations
+from ..motion.segments.completion import SPOTS, TO_POINTS, Deviations, simulate_observations
 from ..motion.segments.dataset import subsample_clips
 from ..motion.segments.embodied import SHAPE
 from ..motion.segments.frames import resting_offsets
@@ -169,6 +169,8 @@ class Recovery:
         else:
             seen, data_set = read_seen(self.file, model, self.markers), _known_data(loaded, data)
             keys = [("seen", f"segment-{n:02d}") for n in range(len(next(iter(seen.values()))))]
+        if self.markers and SPOTS not in seen:
+            raise UsageError("--marker-vertices is for markers, but the observations have none")
         if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
             raise UsageError(
                 f"--out {out} can show one of {len(keys)} segments; end its name in .npz, or use no suffix"

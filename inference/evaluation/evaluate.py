@@ -305,8 +305,8 @@ class _Evaluator:
 
         def terms_of(batch: Batch) -> dict[str, Tensor]:
             terms = elbo.terms(model, batch)
-            kl = {f"KL {latent}": kl / terms.n_steps for latent, kl in terms.kl.items()}
-            return {"ELBO": terms.per_step, **kl, "steps": terms.n_steps}
+            divergences = {f"KL {latent}": kl / terms.n_steps for latent, kl in terms.kl.items()}
+            return {"ELBO": terms.per_step, **divergences, "steps": terms.n_steps}
 
         run = replayed(graphs, "bound", terms_of)
         for part in parts:

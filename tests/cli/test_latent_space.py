@@ -229,6 +229,7 @@ def test_forecast_commands_suggest_the_right_command(capsys, folder, tmp_path, m
         ("impute RUN --from a --seen markers --frames 3 --fps 10", "--frames is for unknown times"),
         ("impute RUN --from person_0001 --seen markers --frames 101", "segments of this run have 100"),
         ("impute RUN --from person_0001 --seen markers --points 9", "--points is for --seen points"),
+        ("impute RUN --from person_0001 --seen points --marker-vertices 3", "--marker-vertices is for markers, but"),
         ("impute RUN --from a --seen markers --samples 101", "--samples is 101; it must be at most 100"),
         ("impute RUN --from person_0001 person_0001 --seen markers", "names a segment twice"),
         ("impute RUN --from person_0001 person_0002 --seen markers --out a.html", "can show one of 2 segments"),
