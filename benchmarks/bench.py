@@ -1,13 +1,15 @@
 """Run benchmarks, compare them with the last release and store them: `python -m benchmarks.bench`, or `make bench`.
 
-A benchmark is a module of this folder with two members. `rows(device)` returns numbers by name. `TARGETS` maps some of
-the names to a side and a bound, or None. Numbers are ratios within one run, or sizes. Lower is better for "at most",
+A benchmark is a module of this folder with two members. `rows(device)` returns by name numbers, or functions that
+return a number or numbers by name. If such a function fails, only its rows are missing. `TARGETS` maps some of the
+names to a side and a bound, or None. Numbers are ratios within one run, or sizes. Lower is better for "at most",
 the default, and higher for "at least". "under" and "over" only have a bound: exponents and seconds differ by more than
 a tenth between machines.
 
-The exit status is 1 if a row is worse by more than a tenth than at the last release, or misses a target that it met
-there. The release is the first record of the last version. Machines of one name differ by as much, so such a row is
-measured again, and the better value counts. Then it is compared with the code of that record on this machine.
+The exit status is 1 if a measurement fails, or a row is worse by more than a tenth than at the last release, or misses
+a target that it met there. The release is the first record of the last version. Machines of one name differ by as much,
+so such a row is measured again, and the better value counts. Then it is compared with the code of that record on this
+machine.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+import traceback
+from collections.abc import Callable, Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any, Literal
@@ -33,12 +36,13 @@ from .studies.results import RESULTS, Table, refuse_unknown, require_gpu, write
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
+"""Records of the processor; those of a GPU are in gpu-history.json."""
 NAMES = ("speed", "gsps", "hit_dvae", "mix_and_match", "trajevae")
 NAMES += ("completion", "startup", "files", "mapped", "scaling", "graphs")
 PROCESSORS = {
     "speed: segments": "says what one core does",
     "gsps: memory": "is the process's, not the device's",
-    "startup": "is of programs that start, which use no device",
+    "startup: all but the first step": "is of programs that use no device",
     "files": "is of files, which use no device",
     "mapped": "is of files and of the process's memory",
     "scaling": "is of processes that share the cores",
@@ -56,13 +60,40 @@ LESS = ("at most", "under")
 COMPARED = ("at most", "at least")
 
 
-def measured(name: str, device: torch.device) -> tuple[Rows, dict[str, Target]]:
-    """Run a benchmark; return its rows and their targets, with the benchmark's name as prefix."""
-    module = importlib.import_module(f".{name}", __package__)
+def measured(
+    name: str, device: torch.device, store: Callable[[Rows, Targets, dict[str, str]], None] = lambda *_: None
+) -> tuple[Rows, dict[str, Target]]:
+    """Run a benchmark; return its rows and their targets, with the benchmark's name as prefix.
+
+    Args:
+        name: name of the benchmark.
+        device: device of models and data.
+        store: function that is called after each part, with all rows and targets so far, and with the reason of each
+            part that failed.
+    """
+    rows, targets, failures = Rows(), dict[str, Target](), dict[str, str]()
     torch.manual_seed(0)
-    values = module.rows(device)
-    targets = {f"{name}: {row}": module.TARGETS.get(row, ("at most", None)) for row in values}
-    return {f"{name}: {row}": value for row, value in values.items()}, targets
+    try:
+        module = importlib.import_module(f".{name}", __package__)
+        parts = module.rows(device)
+    except Exception as error:
+        parts, failures[name] = {}, reason_of(error)
+        store(rows, targets, failures)
+    for part, value in parts.items():
+        try:
+            result = value() if callable(value) else value
+        except Exception as error:
+            failures[f"{name}: {part}"] = reason_of(error)
+            result = {}
+        for row, number in (result if isinstance(result, dict) else {part: result}).items():
+            rows[f"{name}: {row}"], targets[f"{name}: {row}"] = number, module.TARGETS.get(row, ("at most", None))
+        store(rows, targets, failures)
+    return rows, targets
+
+
+def reason_of(error: Exception) -> str:
+    """Return the message of an error with its kind."""
+    return "".join(traceback.format_exception_only(error)).strip()
 
 
 def meets(value: float, target: Target) -> bool:
@@ -141,7 +172,14 @@ def machine(device: torch.device) -> dict[str, Any]:
 
 
 def add_record(records: list[dict[str, Any]], record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the history with a record added; a version keeps its first and its last record, with rows merged."""
+    """Return the history with a record added; a version keeps its first and its last record, with rows merged.
+
+    Rows of parts that failed in the last run are dropped.
+    """
+
+    def failed(row: str) -> bool:
+        return any(row.partition(mark)[0] in record.get("failed", ()) for mark in ",:")
+
     alike = [
         each
         for each in records
@@ -149,7 +187,7 @@ def add_record(records: list[dict[str, Any]], record: dict[str, Any]) -> list[di
     ]
     matching = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
     merged = {
-        key: {name: value for part in (*matching, record) for name, value in part[key].items()}
+        key: {name: value for part in (*matching, record) for name, value in part[key].items() if not failed(name)}
         for key in ("rows", "targets")
     }
     if not matching:
@@ -188,6 +226,7 @@ def tabulate(records: list[dict[str, Any]], results: Path = RESULTS) -> None:
         lines.append([name, *target, f"{value:.2f}", release, change])
     commits = sorted({commit for _, commit in before.values()})
     note = f"Last: {last['version']} ({last['commit']}), {last['date']}; release: {', '.join(commits) or 'none'}."
+    note += f" Failed: {', '.join(last['failed'])}." if last.get("failed") else ""
     history = Table(["", "target", "met", "last", "release", "last over release"], lines, note)
     write(results, {f"speed/{'history' if device_and_threads(last)[0] == 'cpu' else 'gpu-history'}": history})
 
@@ -211,7 +250,7 @@ def main(
         names: benchmarks to run.
         threads: number of torch threads.
         device: device of models and data. A GPU skips some rows; the output names them.
-        out: file of the numbers, written after each benchmark.
+        out: file of the numbers, written after each part of a benchmark.
         keep: whether to add the numbers to the history and its table.
     """
     refuse_unknown("benchmark", names, NAMES)
@@ -231,11 +270,27 @@ def main(
         "date": date.today().isoformat(),
         "machine": machine(place),
     }
-    records = json.loads(HISTORY.read_text()) if HISTORY.exists() else []
+    history = HISTORY if device == "cpu" else HISTORY.with_name(f"gpu-{HISTORY.name}")
+    records = json.loads(history.read_text()) if history.exists() else []
     release = {} if RELEASE_RUN in os.environ else release_rows(records, record)
     numbers: Rows = {}
     targets: dict[str, Target] = {}
+    failures: dict[str, str] = {}
     failed: list[str] = []
+
+    def store(rows: Rows, bounds: Targets, reasons: Mapping[str, str]) -> None:
+        for part in reasons.keys() - failures.keys():
+            print(f"  {part} failed: {reasons[part]}", flush=True)
+        numbers.update({row: round(value, 4) for row, value in rows.items()})
+        targets.update(bounds)
+        failures.update(reasons)
+        last = record | {"rows": numbers, "targets": targets, "failed": failures}
+        out.write_text(json.dumps(last, indent=1) + "\n")
+        if keep:
+            updated = add_record(records, last)
+            history.write_text(json.dumps(updated, indent=1) + "\n")
+            tabulate(updated)
+
     for name in names:
         print(f"{name} ...", flush=True)
         skipped = GPUS if device == "cpu" else PROCESSORS
@@ -244,7 +299,7 @@ def main(
             print(f"  {row} is left out: it {reason}", flush=True)
         if name in left_out:
             continue
-        rows, bounds = measured(name, place)
+        rows, bounds = measured(name, place, store)
         before = {row: release[row][0] for row in rows if row in release}
         if slower(rows, bounds, before):
             rows = better(rows, measured(name, place)[0], bounds)
@@ -261,22 +316,20 @@ def main(
             was = f"{before[row]:8.2f}" if row in before else " " * 8
             side, bound = bounds[row]
             print(f"  {row:50} {value:8.2f} {was}   {'' if bound is None else f'{side} {bound:g}'}", flush=True)
-        numbers |= {row: round(value, 4) for row, value in rows.items()}
-        targets |= bounds
-        record_now = record | {"rows": numbers, "targets": targets}
-        out.write_text(json.dumps(record_now, indent=1) + "\n")
-        if keep:
-            records = add_record(records, record_now)
-            HISTORY.write_text(json.dumps(records, indent=1) + "\n")
-            tabulate(records)
-    for title, lines in (("targets missed:", missed(numbers, targets)), ("slower than at the last release:", failed)):
+        store(rows, bounds, {})
+    messages = {
+        "targets missed:": missed(numbers, targets),
+        "slower than at the last release:": failed,
+        "failed:": [f"{part}: {why}" for part, why in failures.items()],
+    }
+    for title, lines in messages.items():
         if lines:
             print(title, *lines, sep="\n  ")
-    return int(bool(failed))
+    return int(bool(failed or failures))
 
 
 if __name__ == "__main__":
     try:
         sys.exit(tyro.cli(main, description=__doc__))
     except KeyboardInterrupt:
-        sys.exit("stopped; finished benchmarks are written; to continue, give the names of the others")
+        sys.exit("stopped; finished rows are written; to continue, give the names of the other benchmarks")

@@ -1,11 +1,15 @@
 """Startup time of the command line over `import torch`: `python -m benchmarks.bench startup`.
 
-Times are the shortest of several starts; the sides alternate.
+Times are the shortest of several starts; the sides alternate. The rows "first step" are the seconds of one start of
+`dvae fit srnn --steps 1` on simulated people, with validation and checkpoint; with a CUDA graph, of five steps.
 """
 
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 
 import torch
 
@@ -23,6 +27,9 @@ TARGETS = {
     "dvae list": ("at most", 1.3),
     "dvae fit vae --help": ("at most", 2.5),
     "import dvae": ("at most", 0.3),
+    "first step on a CPU": ("under", None),
+    "first step on a GPU": ("under", 10.0),
+    "first step with a CUDA graph": ("under", 10.0),
 }
 
 
@@ -32,9 +39,36 @@ def seconds(*arguments: str) -> float:
     return time.perf_counter() - start
 
 
-def rows(_: torch.device) -> dict[str, float]:
+def first_step(*options: str) -> float:
+    """Return the seconds of a fit in a new process.
+
+    Raises:
+        RuntimeError: the fit fails.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        command = [sys.executable, "-m", "dvae.cli", "fit", "srnn", "--out", f"{folder}/run", *options]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        duration = time.perf_counter() - start
+    if result.returncode:
+        raise RuntimeError(result.stderr)
+    return duration
+
+
+def commands() -> dict[str, float]:
+    """Return the time of each command over `import torch`."""
     least = dict.fromkeys(["torch", *COMMANDS], float("inf"))
     for _ in range(5):
         for name, arguments in {"torch": TORCH, **COMMANDS}.items():
             least[name] = min(least[name], seconds(*arguments))
     return {name: least[name] / least["torch"] for name in COMMANDS}
+
+
+def rows(device: torch.device) -> dict[str, Callable[[], float | dict[str, float]]]:
+    fit = partial(first_step, "--accelerator", device.type, "--steps")
+    if device.type == "cpu":
+        return {"commands": commands, "first step on a CPU": partial(fit, "1")}
+    return {
+        "first step on a GPU": partial(fit, "1"),
+        "first step with a CUDA graph": partial(fit, "5", "--cuda-graph"),
+    }

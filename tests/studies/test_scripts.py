@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import bench, speed
+from benchmarks import bench, graphs, speed, startup
+from benchmarks import trajevae as trajevae_speed
 from benchmarks.studies import (
     angles,
     audits,
@@ -841,7 +842,7 @@ def benches(tmp_path, monkeypatch, capsys):
 
     def run(*measurements, targets=BENCHES, commit="b", version="1.0", keep=False):
         remaining = [dict(zip(targets, rows, strict=True)) for rows in measurements]
-        monkeypatch.setattr(bench, "measured", lambda name, device: (dict(remaining.pop(0)), targets))
+        monkeypatch.setattr(bench, "measured", lambda *_: (dict(remaining.pop(0)), targets))
         monkeypatch.setattr(bench, "commit", lambda: commit)
         monkeypatch.setattr(bench.dvae, "__version__", version)
         status = bench.main(("speed",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=keep)
@@ -912,6 +913,82 @@ def test_a_release_is_the_first_record_of_its_version(benches):
     benches((1.1, 5.0, 7.0, 0.01), commit="d", version="2.0", keep=True)
     assert benches((1.2, 5.0, 7.0, 0.01), commit="e", version="2.0")[0] == 0
     assert benches.row("speed: step") == ["at most 2", "yes", "1.10", "1.00", "1.10"]
+
+
+def fail(error=RuntimeError("no graph")):
+    raise error
+
+
+def test_a_part_that_fails_loses_only_its_rows(benches, monkeypatch, tmp_path, capsys):
+    parts = {"step": 1.0, "broken": fail, "filter": lambda: {"filter": 2.0, "filter-step": 3.0}}
+    monkeypatch.setattr(speed, "rows", lambda _: parts)
+    monkeypatch.setattr(trajevae_speed, "rows", lambda _: fail())
+    earlier = {"speed: broken": 1.0, "speed: broken, B 512": 1.0, "speed: other": 1.0, "trajevae: step": 1.0}
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(bench, "measured", bench.measured)  # restores it
+        benches(tuple(earlier.values()), targets=dict.fromkeys(earlier, ("at most", None)), keep=True)
+    options = {"threads": torch.get_num_threads(), "out": tmp_path / "out.json", "keep": True}
+    assert bench.main(("trajevae", "speed"), **options) == 1
+    reasons = {"trajevae": "RuntimeError: no graph", "speed: broken": "RuntimeError: no graph"}
+    printed = capsys.readouterr().out
+    assert all(f"  {part} failed: {reason}\n" in printed for part, reason in reasons.items())
+    rows = {"speed: step": 1.0, "speed: filter": 2.0, "speed: filter-step": 3.0}
+    assert {key: json.loads((tmp_path / "out.json").read_text())[key] for key in ("rows", "failed")} == {
+        "rows": rows,
+        "failed": reasons,
+    }
+    assert json.loads(benches.history.read_text())[-1]["rows"] == {"speed: other": 1.0, **rows}
+    assert results.read("speed/history", tmp_path).note.endswith("Failed: trajevae, speed: broken.")
+
+
+def test_finished_parts_are_stored_before_the_end(benches, monkeypatch, tmp_path):
+    monkeypatch.setattr(speed, "rows", lambda _: {"step": lambda: 1.0, "stopped": lambda: fail(KeyboardInterrupt)})
+    with pytest.raises(KeyboardInterrupt):
+        bench.main(("speed",), threads=torch.get_num_threads(), out=tmp_path / "out.json", keep=True)
+    assert json.loads(benches.history.read_text())[-1]["rows"] == {"speed: step": 1.0}
+
+
+def test_a_gpu_has_its_own_history(benches, monkeypatch, tmp_path):
+    machine = {"device": "H200", "threads": torch.get_num_threads()}
+    monkeypatch.setattr(bench, "require_gpu", lambda _: None)
+    monkeypatch.setattr(bench, "machine", lambda _: machine)
+    monkeypatch.setattr(startup, "first_step", lambda *options: float("--cuda-graph" in options))
+    options = {"threads": torch.get_num_threads(), "out": tmp_path / "out.json", "keep": True}
+    assert bench.main(("startup",), device="cuda", **options) == 0
+    (record,) = json.loads((tmp_path / "gpu-history.json").read_text())
+    assert record["machine"] == machine
+    assert record["rows"] == {"startup: first step on a GPU": 0.0, "startup: first step with a CUDA graph": 1.0}
+    assert [row[1] for row in results.read("speed/gpu-history", tmp_path).rows] == ["under 10"] * 2
+    assert not benches.history.exists()
+
+
+def test_a_fit_that_fails_has_no_time(monkeypatch):
+    run = SimpleNamespace(
+        run=lambda command, **_: SimpleNamespace(returncode=int("--bad" in command), stderr="no data")
+    )
+    monkeypatch.setattr(startup, "subprocess", run)
+    assert startup.first_step("--good") >= 0
+    with pytest.raises(RuntimeError, match="no data"):
+        startup.first_step("--bad")
+
+
+def test_steps_with_graphs_have_the_final_scheduled_sampling(monkeypatch):
+    """A core of the processor takes the same steps."""
+    steps = []
+    monkeypatch.setattr(graphs, "step_of", lambda *arguments, **options: steps.append((arguments, options)))
+    monkeypatch.setattr(graphs, "seconds", lambda *actions, **_: [1.0, 0.5, 2.0] if len(actions) == 3 else [16.0])
+    parts = graphs.rows(torch.device("cuda"))
+    assert {row for name in parts for row in (name, f"{name}, B 512", f"{name}, over a core")} >= {*graphs.TARGETS}
+    for name, probability in (("cvae", 1.0), ("hit-dvae", 1.0), ("gsps", 0.0)):
+        assert parts[name]() == {name: 2.0, f"{name}, B 512": 4.0, f"{name}, over a core": 128.0}
+        assert {options["scheduled_sampling"] for _, options in steps} == {probability}
+        assert [(cuda_graph, device.type) for (_, _, cuda_graph, device), _ in steps] == [
+            (False, "cuda"),
+            (True, "cuda"),
+            (True, "cuda"),
+            (False, "cpu"),
+        ]
+        steps.clear()
 
 
 def test_a_release_is_measured_by_its_own_code(tmp_path, monkeypatch):
