@@ -265,6 +265,7 @@ class FactorizationContract:
             model.forecast(past, 1)
             self._close({"bound": bound.detach().cpu()}, {"bound": expected})
 
+    @pytest.mark.gpu
     @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
     def test_a_bound_on_a_gpu_is_the_processors(self) -> None:
         """With the same noise, a bound and its gradient are equal on GPU and CPU."""

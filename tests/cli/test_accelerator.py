@@ -70,6 +70,7 @@ def test_a_command_computes_the_same_on_a_gpu(name, words, tmp_path, monkeypatch
     assert_equal(*(contents(tmp_path / f"{device}.{suffix}") for device in ("cpu", "gpu")))
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_runs_on_a_gpu(name, words, tmp_path):

@@ -18,6 +18,7 @@ with pytest.MonkeyPatch.context() as environment:
     pytest.importorskip("triton")
     from dvae.distributions import chain_kernel
 
+pytestmark = pytest.mark.gpu
 LATENT = 3
 
 

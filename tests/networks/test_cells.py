@@ -24,6 +24,7 @@ def test_layers_run_in_training_mode_if_gradients_are_needed(kind, base, monkeyp
     assert is_training == [True, False]
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU is available")
 @pytest.mark.parametrize(("kind", "base"), KINDS)
 def test_gradients_in_evaluation_on_a_gpu_equal_the_cpu(kind, base):

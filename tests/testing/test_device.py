@@ -155,6 +155,7 @@ def assert_same(terms, expected):
         torch.testing.assert_close(got, numbers(here), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.gpu
 @on_gpu
 @pytest.mark.parametrize("name", METHODS)
 def test_a_step_on_a_gpu_equals_the_cpu(name, small_method):
@@ -168,6 +169,7 @@ def test_a_step_on_a_gpu_equals_the_cpu(name, small_method):
     assert_same(terms, expected)
 
 
+@pytest.mark.gpu
 @on_gpu
 @pytest.mark.parametrize("name", METHODS)
 def test_a_gpu_synchronizes_as_often_as_the_stand_in(name, small_method):
@@ -190,7 +192,7 @@ def test_a_gpu_synchronizes_as_often_as_the_stand_in(name, small_method):
     assert len(synchronizations) == sum((STEP | BESIDE.get(name, {})).values()), synchronizations
 
 
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=on_gpu)])
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, on_gpu])])
 @pytest.mark.parametrize("name", METHODS)
 def test_terms_have_the_precision_of_the_model_under_autocast(name, device, small_method):
     """The error in mixed precision is at most the error due to rounding the weights to bfloat16."""
@@ -305,6 +307,7 @@ def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
         assert all(each.graphs for each in captured)
 
 
+@pytest.mark.gpu
 @on_gpu
 @pytest.mark.filterwarnings("ignore:the training step runs without a CUDA graph")
 @pytest.mark.filterwarnings("ignore:validation runs without a CUDA graph")

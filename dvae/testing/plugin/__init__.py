@@ -23,6 +23,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--elbo-strict", action="store_true", help="fail where elbo_regression has no record yet")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the mark of the contract's test on a GPU."""
+    config.addinivalue_line("markers", "gpu: computes on a GPU if there is one")
+
+
 @pytest.fixture
 def elbo_regression(request: pytest.FixtureRequest) -> ElboRegression:
     """Return the fixture whose `check(model, guide, data)` fails if the evidence bound is significantly worse."""
