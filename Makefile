@@ -4,15 +4,18 @@
 # make studies   the longer notebooks, on a small share of their work
 # make fuzz    hostile and random examples, new ones each time, for SECONDS=600; SEED=n tries those of a run again
 # make coverage   the tests, and which lines none of them runs
-# make gpu     on a machine with a GPU: its tests, and the speed of training steps; 10 minutes
-# make bench   the benchmarks, beside their targets and the last release; as JSON in bench.json; on a GPU with DEVICE=cuda
+# make gpu     on a machine with a GPU: its tests, start-up, and the speed of training steps; at most 10 minutes
+# make bench   the benchmarks, beside their targets and the last release; as JSON in bench.json; on a GPU with DEVICE=cuda,
+#              which also stores them in benchmarks/gpu-history.json and docs/results/speed.md
 # make notebooks   runs the notebooks and stores them with what they show
 # make docs    the site, in docs/_build/html
 # make dist    sdist, and from it the wheel, in dist; installed and started where there is nothing else
-# Each makes the environment in .venv when it is missing or out of date.
+# Each makes the environment in .venv when it is missing or out of date. ENV=/usr uses the one of /usr/bin/python3 as it
+# is, with nothing installed; it needs the packages of the extra dev.
 
 PYTHON := python3
-BIN := .venv/bin
+ENV :=
+BIN := $(or $(ENV),.venv)/bin
 
 # One thread: the models are small, and on cores that others use too, two threads wait for each other many times longer.
 export OMP_NUM_THREADS := 1
@@ -36,7 +39,7 @@ torch = @test `uname` != Linux || command -v nvidia-smi > /dev/null || $(pip_tor
 
 .PHONY: venv demo lint quick test studies fuzz coverage gpu bench notebooks docs dist clean
 
-venv: .venv/installed
+venv: $(if $(ENV),,.venv/installed)
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -77,14 +80,17 @@ fuzz: venv
 coverage: venv
 	$(BIN)/pytest -n 2 --cov --cov-report=term-missing:skip-covered --cov-fail-under=97
 
+# Measurements follow failed tests too. An interrupt keeps the finished rows.
 gpu: venv
-	TRITON_DEFAULT_FP_FUSION=1 $(BIN)/pytest -n 4 -k "gpu or kernel"
-	$(BIN)/python -m benchmarks.bench graphs speed --device cuda --keep
+	TRITON_DEFAULT_FP_FUSION=1 timeout -k 10 230 $(BIN)/python3 -m pytest -n 4 -m gpu --timeout 60; tests=$$?; \
+	timeout -s INT -k 10 320 $(BIN)/python3 -m benchmarks.bench startup graphs speed --device cuda --keep && test $$tests = 0; \
+	status=$$?; $(BIN)/python3 -m benchmarks.studies.cards && exit $$status
 
 DEVICE := cpu
 
 bench: venv
-	$(BIN)/python -m benchmarks.bench --device $(DEVICE)
+	$(BIN)/python3 -m benchmarks.bench --device $(DEVICE) $(if $(filter cuda,$(DEVICE)),--keep); status=$$?; \
+	$(BIN)/python3 -m benchmarks.studies.cards && exit $$status
 
 notebooks: venv
 	$(BIN)/python -m benchmarks.studies.notebooks notebooks/*.ipynb

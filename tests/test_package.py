@@ -43,6 +43,21 @@ def test_the_workflow_tests_the_supported_versions():
     assert classifiers == {c for c in PROJECT["project"]["classifiers"] if c.startswith("Programming Language")}
 
 
+@pytest.mark.skipif(not shutil.which("make") or not shutil.which("timeout"), reason="make or timeout is not installed")
+@pytest.mark.parametrize("failing", ["", "pytest", "bench ", "cards"])
+def test_measurements_on_a_gpu_follow_failed_tests_in_an_existing_environment(failing, tmp_path):
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    (tmp_path / "env" / "bin").mkdir(parents=True)
+    python = tmp_path / "env" / "bin" / "python3"
+    python.write_text(f'#!/bin/sh\necho "$@" >> log.txt\ncase "$*" in *"{failing or "none"}"*) exit 3;; esac\n')
+    python.chmod(0o755)
+    process = subprocess.run(["make", "gpu", "ENV=env"], cwd=tmp_path, capture_output=True, text=True)
+    assert bool(process.returncode) == bool(failing), process.stderr
+    modules = [line.split()[1] for line in (tmp_path / "log.txt").read_text().splitlines()]
+    assert modules == ["pytest", "benchmarks.bench", "benchmarks.studies.cards"]
+    assert not (tmp_path / ".venv").exists()
+
+
 @pytest.mark.skipif(not shutil.which("make"), reason="make is not installed")
 @pytest.mark.parametrize(
     ("gpu", "is_available", "expected"),
