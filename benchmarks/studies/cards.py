@@ -21,7 +21,7 @@ from typing import Any
 import tyro
 
 from .engine import settings
-from .results import DOCS, Table, read
+from .results import DOCS, RESULTS, Table, read
 
 CARDS = settings(__file__)
 
@@ -63,8 +63,9 @@ def card(
     columns: Mapping[str, str | Sequence[str]],
     rows: Sequence[str] | Mapping[str, str | Sequence[str]] = (),
     source: str | Sequence[str] = (),
+    absent: str = "",
 ) -> Table:
-    """Return a table of a card.
+    """Return a table of a card; with `absent`, rows may have no cells.
 
     Raises:
         ValueError: no source has a row or a column.
@@ -82,7 +83,7 @@ def card(
         columns_of_cells.append([next((cell for cell in each if cell is not None), "") for each in cells])
     lines = dict(zip(names, zip(*columns_of_cells, strict=True), strict=True))
     for kind, lists in ("row", lines), ("column", dict(zip(columns, columns_of_cells, strict=True))):
-        if missing := [name for name, cells in lists.items() if not any(cells)]:
+        if not absent and (missing := [name for name, cells in lists.items() if not any(cells)]):
             raise ValueError(f"no source has the {kind} {', '.join(missing)}")
     printed = zip(*([cell or "–" for cell in aligned(cells)] for cells in columns_of_cells), strict=True)
     return Table(["", *columns], [[name, *cells] for name, cells in zip(names, printed, strict=True)])
@@ -99,7 +100,10 @@ def fill_page(page: str, tables: Mapping[str, Any]) -> str:
     if sorted(marked) != sorted(tables):
         raise ValueError(f"{page}.md has marks for {marked}, cards.toml tables for {[*tables]}")
     for name, options in tables.items():
-        block = f"<!-- table: {name} -->\n\n{card(**options).markdown()}\n<!-- end of table -->"
+        absent = options.get("absent", "")
+        is_absent = absent and not (RESULTS / f"{options['source']}.csv").exists()
+        content = f"{absent}\n" if is_absent else card(**options).markdown()
+        block = f"<!-- table: {name} -->\n\n{content}\n<!-- end of table -->"
         marks = f"<!-- table: {re.escape(name)} -->.*?<!-- end of table -->"
         text = re.sub(marks, lambda _, block=block: block, text, flags=re.DOTALL)
     return text
