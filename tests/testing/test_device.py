@@ -311,20 +311,26 @@ def test_replayed_steps_equal_steps_on_the_cpu(name, small_method):
 @on_gpu
 @pytest.mark.filterwarnings("ignore:the training step runs without a CUDA graph")
 @pytest.mark.filterwarnings("ignore:validation runs without a CUDA graph")
+@pytest.mark.parametrize("precision", ["64-true", "32-true", "bf16-mixed"])
 @pytest.mark.parametrize("name", METHODS)
-def test_replayed_steps_on_a_gpu_equal_steps_without_graphs(name, small_method):
-    """Over 50 steps; the random states are equal."""
-    count, runs = 50, []
+def test_replayed_steps_on_a_gpu_equal_steps_without_graphs(name, precision, small_method, monkeypatch):
+    """Over 50 steps in float32, with validations; the random states are equal. Only bfloat16 may round differently."""
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    count, runs = 50 if precision == "32-true" else 15, []
     for cuda_graph in (False, True):
-        model, recipe, _, _ = small_method(name, count)
+        model, recipe, train, _ = small_method(name, count)
+        model = model.double() if precision == "64-true" else model
+        held_out = train.sample(3, torch.Generator().manual_seed(1))
         options = {"steps": count, "scheduled_sampling": recipe.feeding, "progress": False, "accelerator": "cuda"}
-        options["learning_rate"] = 2**-10  # graphs read it in float32, which represents it exactly
-        svi = dvae.SVI(model.double(), stages=recipe.stages, cuda_graph=cuda_graph, **options)
+        options |= {"learning_rate": 2**-10, "precision": precision}  # graphs read it in float32, which represents it
+        svi = dvae.SVI(model, stages=recipe.stages, cuda_graph=cuda_graph, **options)
         svi.init()
-        runs.append((steps_of(svi, recipe, count), svi.random))
-    assert bool(svi.captured.graphs) == (name not in UNCAPTURED)
-    torch.testing.assert_close(runs[1][0], runs[0][0], rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(runs[1][1], runs[0][1], rtol=0, atol=0)
+        steps = steps_of(svi, recipe, count)
+        runs.append((steps, [svi.evaluate(held_out) for _ in range(WARM_UP + 2)], svi.random))
+    assert all(bool(each.graphs) == (name not in UNCAPTURED) for each in (svi.captured, svi.captured_validation))
+    tolerance = 0.1 if precision == "bf16-mixed" else 1e-5
+    torch.testing.assert_close(runs[1][:2], runs[0][:2], rtol=tolerance, atol=tolerance)
+    torch.testing.assert_close(runs[1][2], runs[0][2], rtol=0, atol=0)
 
 
 def test_a_refused_step_changes_no_buffers(small_method):
