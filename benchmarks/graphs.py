@@ -45,8 +45,8 @@ def step_of(model: Any, batch: Any, cuda_graph: bool, device: torch.device, **op
     for _ in range(5 if cuda_graph else 1):
         svi.step(batch)
     if cuda_graph and not (svi.captured and svi.captured.graphs):
-        places = [place for each in svi.captured.obstacles.values() for place in each] if svi.captured else []
-        raise RuntimeError(f"the step has no graph: {', '.join(places) or 'see the warning of the fit'}")
+        places = {place for each in svi.captured.obstacles.values() for place in each} if svi.captured else ()
+        raise RuntimeError(f"the step has no graph: {', '.join(sorted(places)) or 'see the warning of the fit'}")
     return lambda: svi.step(batch)
 
 
