@@ -82,8 +82,8 @@ class MotionLatent(Method):
         widths: widths of the encoder's layers; the decoder has them in reverse order.
         shaped: whether the guide reads beta.
         kl: weight of the KL. At the default, the posteriors of segments fill too little of N(0, I) to generate motion
-            from it. At 10, they fill it, but reconstruction errors are a third larger after 1,500 steps, and 2.4 times
-            as large after longer training (docs/results/motion_latent_4d.md).
+            from it. At 1, they fill it after 100,000 steps, and at 10 after 20,000, but reconstruction errors are twice
+            as large (docs/results/motion_latent_4d.md).
         published: train as in the paper, with its number of steps for 13,121 segments. This changes the defaults of the
             options below.
         scale: standard deviation of all numbers of chi; None, here and below, for the default. The published value
