@@ -327,7 +327,7 @@ def with_residual(distribution: Any, residual: float) -> Any:
         family = next((name for name, spec in FAMILIES.items() if spec == distribution), kind)
         raise ValueError(
             f"residual is {residual}, but the family {family!r} has no location to which the previous value can be "
-            "added; leave residual at 0, or give these columns the family real (positive ones: the units changes)"
+            'added; leave residual at 0, or give these columns the family "real", or positive columns units="changes"'
         )
     return replace(distribution, residual=residual)
 

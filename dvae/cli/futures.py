@@ -236,7 +236,7 @@ def impute(
 
     For a motion-latent run, recovers segments with their timing and bodies. `--from NAME --seen markers` tests this on
     known segments. --file reads observations: an npz of `times` (K,) in seconds or `frames` (K,) of 100, and any of
-    `surfaces` (K, vertices, 3), `points` (K, any, 3) and `markers` (K, 16, 3) in metres. Missing observations are NaN.
+    `surfaces` (K, vertices, 3), `points` (K, any, 3) and `markers` (K, any, 3) in metres. Missing observations are NaN.
     The file contains `beta` (S,) if the body is known. Several segments have arrays (B, K, ...). Prints duration and
     distance with intervals, and the distance from the observations and, if known, from the truth. --out writes an npz
     of the most probable segments and posterior draws, or .html or .bvh for a single segment. A name without a suffix is

@@ -133,7 +133,7 @@ class Recovery:
         file: npz file of your own observations, instead of simulated ones.
         aggregate: use a normal distribution fitted to the latents of known segments as prior of z, instead of N(0, I).
         two_way: for points: vertices far from all points are errors, too, as in a two-way Chamfer distance.
-        markers: vertices of the body on which the markers are; those of the default body if empty.
+        marker_vertices: vertices of the body on which the markers are; those of the default body if empty.
     """
 
     glimpse: Glimpse = Glimpse()
@@ -143,7 +143,7 @@ class Recovery:
     file: Path | None = None
     aggregate: Expert[bool] = True
     two_way: Expert[bool] = False
-    markers: Annotated[Expert[tuple[int, ...]], tyro.conf.arg(name="marker-vertices")] = ()
+    marker_vertices: Expert[tuple[int, ...]] = ()
 
     def run(self, run: Path, out: Path | None, draws: int, seed: int, data: str | None, use: Use) -> None:
         """Recover segments, print the estimates with their uncertainty, and write them."""
@@ -165,11 +165,11 @@ class Recovery:
             if len({*keys}) < len(keys):
                 raise UsageError(f"--from {' '.join(self.source)} names a segment twice")
             truth = {name: torch.cat([segments.all()[name] for segments in selected]) for name in (WHOLE, SHAPE)}
-            seen = self.glimpse.of(model, truth, self.markers, seed)
+            seen = self.glimpse.of(model, truth, self.marker_vertices, seed)
         else:
-            seen, data_set = read_seen(self.file, model, self.markers), _known_data(loaded, data)
+            seen, data_set = read_seen(self.file, model, self.marker_vertices), _known_data(loaded, data)
             keys = [("seen", f"segment-{n:02d}") for n in range(len(next(iter(seen.values()))))]
-        if self.markers and SPOTS not in seen:
+        if self.marker_vertices and SPOTS not in seen:
             raise UsageError("--marker-vertices is for markers, but the observations have none")
         if out is not None and out.suffix.lower() not in (".npz", "") and len(keys) > 1:
             raise UsageError(
@@ -179,7 +179,7 @@ class Recovery:
         training_segments = None if data_set is None else _other_segments(data_set, takes)
         options: dict[str, Any] = {"truth": truth, "deviations": self.deviations, "known": training_segments}
         options |= {"descent": self.descent, "aggregate": self.aggregate, "two_way": self.two_way}
-        options["markers"] = self.markers
+        options["markers"] = self.marker_vertices
         recovered = recover_segments(model, seen, keys, **options, seed=seed, progress=True)
         for warning in _warnings(recovered, self.deviations):
             note(warning)

@@ -163,6 +163,9 @@ def test_markers_can_be_on_any_vertices(capsys, folder, loaded_run, tmp_path):
     assert table.split("seen/segment-00 │ ")[1].split(" │ ")[0] in simulated
     wrong = ["impute", str(folder / "run"), "--file", str(tmp_path / "seen.npz")]
     assert "expected (2, " in failure(capsys, *wrong)
+    error = failure(capsys, *wrong, "--marker-vertices", "0", "x", code=2)
+    assert "Error parsing --marker-vertices" in error
+    assert "is not an option" not in error
     assert "marker vertex 999999 does not exist" in failure(capsys, *wrong, "--marker-vertices", "0", "5", "999999")
 
 

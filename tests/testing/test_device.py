@@ -447,7 +447,7 @@ class TestCapturedStep:
             assert len(svi.captured.graphs) == 2
 
     def test_each_stage_has_its_graphs(self):
-        """Those of an earlier stage are dropped with their memory."""
+        """The graphs of an earlier stage are dropped, and their memory is free."""
         stages = [dvae.Stage(steps, dvae.Evidence(kl_weight=w)) for steps, w in ((6, 0.1), (14, 2.0))]
         stages[1] = replace(stages[1], frozen=("encoder.",))
         runs, batches = [], self.batches(12)

@@ -453,7 +453,7 @@ def simulate_observations(
 
 
 def _check_markers(body: Body, markers: Sequence[int]) -> None:
-    """Raise an error if the markers are no vertices of the body, or those of the bundled person on another body."""
+    """Raise an error if a marker is not a vertex of the body, or if the default markers are used on another body."""
     if tuple(markers) == tuple(MARKERS.values()) and is_from_file(body):
         raise ValueError(
             "the default markers are vertices of the bundled person; give the vertices of this body as `markers` "
