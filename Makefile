@@ -83,7 +83,7 @@ coverage: venv
 # Measurements follow failed tests too. An interrupt keeps the finished rows.
 gpu: venv
 	TRITON_DEFAULT_FP_FUSION=1 timeout -k 10 230 $(BIN)/python3 -m pytest -n 4 -m gpu --timeout 60; tests=$$?; \
-	timeout -s INT -k 10 320 $(BIN)/python3 -m benchmarks.bench startup graphs speed --device cuda --keep && test $$tests = 0; \
+	timeout -s INT -k 10 320 $(BIN)/python3 -m benchmarks.bench startup graphs peers speed --device cuda --keep && test $$tests = 0; \
 	status=$$?; $(BIN)/python3 -m benchmarks.studies.cards && exit $$status
 
 DEVICE := cpu

@@ -38,7 +38,7 @@ HERE = Path(__file__).parent
 HISTORY = HERE / "history.json"
 """Records of the processor; those of a GPU are in gpu-history.json."""
 NAMES = ("speed", "gsps", "hit_dvae", "mix_and_match", "trajevae")
-NAMES += ("completion", "startup", "files", "mapped", "scaling", "graphs")
+NAMES += ("completion", "startup", "files", "mapped", "scaling", "graphs", "peers")
 PROCESSORS = {
     "speed: segments": "says what one core does",
     "gsps: memory": "is the process's, not the device's",
