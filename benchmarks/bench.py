@@ -176,10 +176,6 @@ def add_record(records: list[dict[str, Any]], record: dict[str, Any]) -> list[di
 
     Rows of parts that failed in the last run are dropped.
     """
-
-    def failed(row: str) -> bool:
-        return any(row.partition(mark)[0] in record.get("failed", ()) for mark in ",:")
-
     alike = [
         each
         for each in records
@@ -187,12 +183,22 @@ def add_record(records: list[dict[str, Any]], record: dict[str, Any]) -> list[di
     ]
     matching = [each for n, each in enumerate(alike) if (n > 0) == (record["commit"] != alike[0]["commit"])]
     merged = {
-        key: {name: value for part in (*matching, record) for name, value in part[key].items() if not failed(name)}
+        key: {
+            name: value
+            for part in (*matching, record)
+            for name, value in part[key].items()
+            if not has_failed(name, record)
+        }
         for key in ("rows", "targets")
     }
     if not matching:
         return [*records, record]
     return [record | merged if each is matching[0] else each for each in records]
+
+
+def has_failed(row: str, record: Mapping[str, Any]) -> bool:
+    """Return whether the part of a row failed in a run."""
+    return not {row, row.partition(",")[0], row.partition(":")[0]}.isdisjoint(record.get("failed", ()))
 
 
 def release_rows(records: list[dict[str, Any]], record: dict[str, Any]) -> dict[str, tuple[float, str]]:
@@ -215,19 +221,30 @@ def device_and_threads(record: dict[str, Any]) -> tuple[str, int]:
 
 
 def tabulate(records: list[dict[str, Any]], results: Path = RESULTS) -> None:
-    """Write the table of the last record and of the release; a GPU has a table of its own."""
-    last, before = records[-1], release_rows(records, records[-1])
-    lines = []
-    for name in sorted(last["rows"], key=_place):
-        value, (side, bound) = last["rows"][name], last["targets"].get(name, ("at most", None))
-        target = ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if meets(value, (side, bound)) else "no"]
-        release = f"{before[name][0]:.2f}" if name in before else "–"
-        change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
-        lines.append([name, *target, f"{value:.2f}", release, change])
-    commits = sorted({commit for _, commit in before.values()})
-    note = f"Last: {last['version']} ({last['commit']}), {last['date']}; release: {', '.join(commits) or 'none'}."
+    """Write the table of the last number of each row in this version, and of the release; a GPU has its own table."""
+    last = records[-1]
+    lines: dict[str, list[str]] = {}
+    commits: dict[str, set[str]] = {"Last": set(), "release": set()}
+    for n, each in enumerate(records):
+        if (each["version"], device_and_threads(each)) != (last["version"], device_and_threads(last)):
+            continue
+        before = release_rows(records[: n + 1], each)
+        for name, value in each["rows"].items():
+            side, bound = each["targets"].get(name, ("at most", None))
+            target = (
+                ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if meets(value, (side, bound)) else "no"]
+            )
+            release = f"{before[name][0]:.2f}" if name in before else "–"
+            change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
+            lines[name] = [name, *target, f"{value:.2f}", release, change]
+        commits["Last"].add(f"{each['commit']}, {each['date']}")
+        commits["release"] |= {commit for _, commit in before.values()}
+    note = "; ".join(f"{kind}: {', '.join(sorted(names)) or 'none'}" for kind, names in commits.items()) + "."
     note += f" Failed: {', '.join(last['failed'])}." if last.get("failed") else ""
-    history = Table(["", "target", "met", "last", "release", "last over release"], lines, note)
+    rows = [
+        line for name, line in sorted(lines.items(), key=lambda item: _place(item[0])) if not has_failed(name, last)
+    ]
+    history = Table(["", "target", "met", "last", "release", "last over release"], rows, note)
     write(results, {f"speed/{'history' if device_and_threads(last)[0] == 'cpu' else 'gpu-history'}": history})
 
 

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import bench, graphs, speed, startup
+from benchmarks import bench, graphs, peers, speed, startup
 from benchmarks import trajevae as trajevae_speed
+from benchmarks.speed import training_step
 from benchmarks.studies import (
     angles,
     audits,
@@ -841,7 +842,7 @@ def benches(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench, "measure_at_commit", lambda *_: {})
 
     def run(*measurements, targets=BENCHES, commit="b", version="1.0", keep=False):
-        remaining = [dict(zip(targets, rows, strict=True)) for rows in measurements]
+        remaining = [dict(zip(targets, rows, strict=False)) for rows in measurements]
         monkeypatch.setattr(bench, "measured", lambda *_: (dict(remaining.pop(0)), targets))
         monkeypatch.setattr(bench, "commit", lambda: commit)
         monkeypatch.setattr(bench.dvae, "__version__", version)
@@ -876,6 +877,57 @@ def test_a_row_that_is_slower_than_at_the_last_release_fails_by_its_name(benches
         1,
         "speed: exponent: 1.20 was 0.01 at the last release",
     )
+
+
+def test_the_table_has_the_last_number_of_each_row_in_the_version(benches):
+    benches((1.0, 4.0, 7.0, 0.01), commit="a", version="0.9", keep=True)
+    benches((1.0, 5.0, 7.0, 0.01), commit="b", keep=True)
+    benches((0.8,), commit="c", keep=True)
+    assert benches.row("speed: step") == ["at most 2", "yes", "0.80", "1.00", "0.80"]  # the release is b
+    assert benches.row("speed: gain") == ["at least 3", "yes", "5.00", "4.00", "1.25"]  # it is a for b
+
+
+PUBLIC_CODE = {
+    "config/motion/cfg_storn.ini": "[Network]\nname = STORN\nx_dim = 96\nz_dim = 3\n",
+    "dvae/model/storn.py": """
+import torch
+class STORN(torch.nn.Linear):
+    def forward(self, x):
+        self.z_mean = self.z_logvar = self.z_mean_p = self.z_logvar_p = x.sum()
+        return super().forward(x)
+def build_STORN(cfg, device="cpu"):
+    assert cfg.getint("Network", "z_dim") == 10
+    return STORN(cfg.getint("Network", "x_dim"), 48, device=device)
+""",
+    "dvae/utils/loss.py": """
+def loss_MPJPE(x, y):
+    assert x.shape == y.shape == (5, 2, 48)  # steps first
+    return (x - y).square().sum()
+def loss_KLD(mean, logvar, mean_p, logvar_p):
+    return mean - mean_p
+""",
+}
+
+
+def test_a_step_of_the_public_code_trains_its_model(tmp_path, monkeypatch):
+    for name, text in PUBLIC_CODE.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    models = []
+    monkeypatch.setattr(peers, "training_step", lambda model, loss: models.append(model) or training_step(model, loss))
+    x = torch.randn(2, 5, 48)
+    step = peers.public_step("storn", x, tmp_path)
+    before = (models[0](x) - x).square().mean()
+    assert peers.ratio("storn", lambda *_: step, x, None) > 0
+    assert (models[0](x) - x).square().mean() < before
+
+
+def test_peers_without_clone_and_package_are_left_out(monkeypatch, capsys):
+    monkeypatch.delenv("DVAE_PUBLIC_CODE", raising=False)
+    monkeypatch.setattr(peers.importlib.util, "find_spec", lambda _: None)
+    assert peers.rows(torch.device("cpu")) == {}
+    assert "DVAE_PUBLIC_CODE must name a clone" in (printed := capsys.readouterr().out)
+    assert "it needs the package jax" in printed
 
 
 def test_a_target_that_was_missed_before_is_reported_without_failure(benches):
