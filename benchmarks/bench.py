@@ -237,7 +237,7 @@ def tabulate(records: list[dict[str, Any]], results: Path = RESULTS) -> None:
             release = f"{before[name][0]:.2f}" if name in before else "–"
             change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
             lines[name] = [name, *target, f"{value:.2f}", release, change]
-        commits["Last"].add(f"{each['commit']}, {each['date']}")
+        commits["Last"].add(f"{each['commit']} ({each['date']})")
         commits["release"] |= {commit for _, commit in before.values()}
     note = "; ".join(f"{kind}: {', '.join(sorted(names)) or 'none'}" for kind, names in commits.items()) + "."
     note += f" Failed: {', '.join(last['failed'])}." if last.get("failed") else ""
