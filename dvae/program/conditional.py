@@ -468,8 +468,6 @@ class Conditional(nn.Module):
         Returns:
             Draws and parameters, or None if the factor is not a Gaussian chain.
         """
-        if torch.is_autocast_enabled(noise.device.type):  # the fused loop runs in one precision
-            return None
         if self.factor.child in self.units:
             return None
         form = None if self.network is None else self.network.chain(state)
@@ -484,20 +482,22 @@ class Conditional(nn.Module):
         following = [(layer.weight, layer.bias) for layer in ([*linear, out] if join.first else [])]
 
         def into(values: Tensor) -> Tensor:
+            values = values.to(noise.dtype)  # under autocast, known terms have half precision, but the loop does not
             return values.transpose(0, 1) if direction > 0 else values.transpose(0, 1).flip(0)
 
         def back(values: Tensor) -> Tensor:
             return values.transpose(0, 1) if direction > 0 else values.flip(0).transpose(0, 1)
 
-        *results, states = gaussian_chain(
-            into(hoisted.base),
-            into(noise),
-            [(hoisted.weights[0], None), *following],
-            before=form.before,
-            cell=None if form.cell is None else (into(form.cell[0]), form.cell[1]),
-            min_scale=self.head.min_scale,
-            activation=join.kind,
-        )
+        with torch.autocast(noise.device.type, enabled=False):
+            *results, states = gaussian_chain(
+                into(hoisted.base),
+                into(noise),
+                [(hoisted.weights[0], None), *following],
+                before=form.before,
+                cell=None if form.cell is None else (into(form.cell[0]), form.cell[1]),
+                min_scale=self.head.min_scale,
+                activation=join.kind,
+            )
         # elementwise operations on transposed tensors of few coordinates are not vectorised
         value, *parameters = (back(each).contiguous() for each in results)
         if form.keep is not None and states is not None:

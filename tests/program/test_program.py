@@ -19,6 +19,7 @@ from dvae.inference.training.fit import Callback
 from dvae.locking import serialized
 from dvae.models.method import LatentMethod
 from dvae.networks import Attention, Recurrent
+from dvae.program import conditional
 from dvae.program.particles import Particles
 from dvae.testing import FactorizationContract
 
@@ -220,6 +221,23 @@ def test_mixed_precision_trains(name):
     bound.backward()
     assert torch.isfinite(bound)
     assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+@pytest.mark.parametrize("name", ["srnn", "dkf", "vrnn", "rvae-causal"])
+def test_chains_run_in_float32_under_mixed_precision(name, monkeypatch):
+    model, x, noise = dvae.method(name).build({"x": 3}), torch.randn(4, 6, 3), []
+    chain = conditional.gaussian_chain
+    monkeypatch.setattr(
+        conditional, "gaussian_chain", lambda base, e, *a, **k: noise.append(e) or chain(base, e, *a, **k)
+    )
+    bounds = []
+    for mixed in (False, True):
+        torch.manual_seed(0)
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            bounds.append(SequenceELBO().terms(model, x).bound)
+    assert torch.equal(*noise)
+    assert noise[0].dtype == torch.float32
+    torch.testing.assert_close(*bounds, rtol=2**-6, atol=0)  # bfloat16 has 8 bits
 
 
 # ------------------------------------------------------------------------------------------------------------ inputs
