@@ -230,7 +230,8 @@ def jax_step(name: str, x: Tensor) -> Callable[[], object]:
 
     with mock.patch.object(chain.GaussianChain, "apply", draw), torch.no_grad():
         ours = dvae.Evidence()(dvae.SequenceELBO().terms(model, some), 0).item()
-    theirs = float(code.loss(code.parameters, code.array(some.transpose(0, 1)), code.array(drawn[0])))
+    with code.jax.default_matmul_precision("highest"):  # a GPU computes in TF32 by default, also when timed
+        theirs = float(code.loss(code.parameters, code.array(some.transpose(0, 1)), code.array(drawn[0])))
     if not math.isclose(theirs, ours, rel_tol=1e-5):
         raise ValueError(f"the loss of the JAX code is {theirs}, ours is {ours}")
     return code.step(x)

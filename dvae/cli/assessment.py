@@ -212,7 +212,7 @@ def evaluate(
         ensembles: add a row for the equal-weight mixture of runs that differ only in their seed.
         seed: seed of the draws.
         batch_size: number of windows forecast at once.
-        cuda_graph: with --accelerator cuda, replay forecasts and the ELBO as CUDA graphs.
+        cuda_graph: with --accelerator cuda, replay forecasts and bounds as CUDA graphs.
         out: file to write instead of evaluation.json in each run.
         figure: save the scores as dots with error bars, or as box plots for segments.
     """

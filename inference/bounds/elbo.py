@@ -22,6 +22,8 @@ from pyro.infer import ELBO
 from torch import Tensor
 from torch.distributions import kl_divergence
 
+from ...capture import Captured, replayed
+from ...data.batch import Batch
 from ...factorization.graph import analytic_kl
 from ...locking import serialized
 from ...networks.loop import memoizing
@@ -419,7 +421,13 @@ class IWAEBound:
 
 @torch.no_grad()
 def iwae_bound(
-    model: DynamicalVAE, batch: AnyBatch, particles: int = 100, *, chunk: int = 4096, **options: Any
+    model: DynamicalVAE,
+    batch: AnyBatch,
+    particles: int = 100,
+    *,
+    chunk: int = 4096,
+    graphs: Captured | None = None,
+    **options: Any,
 ) -> IWAEBound:
     """Return the IWAE bound: log of the mean over particles of p(x, z) / q(z | x), per sequence.
 
@@ -432,6 +440,7 @@ def iwae_bound(
         batch: batch as in `DynamicalVAE.model`.
         particles: K, number of particles.
         chunk: largest number of sequences times particles in memory.
+        graphs: CUDA graphs by which to replay the weights of a `Batch` on the GPU.
         options: options of the program.
 
     Returns:
@@ -456,8 +465,34 @@ def iwae_bound(
             evidence = _log_weights(model, data, options)
             return IWAEBound(evidence, torch.full_like(evidence, math.nan if model.bounded else 0.0), particles)
         groups = Groups.of(data.group) if model.grouped and data.group is not None else None
-        weights = partial(_repeated_weights, model, data, options)
+        weights = replayed_weights(
+            graphs, "IWAE bound", model, batch if graphs else data, partial(_repeated_weights, model, options)
+        )
         return importance_mean(weights, size, particles, chunk, groups)
+
+
+def replayed_weights(
+    graphs: Captured | None,
+    kind: str,
+    model: DynamicalVAE,
+    batch: AnyBatch,
+    log_weights_of: Callable[[Batch, int], Tensor],
+) -> Callable[[int], Tensor]:
+    """Return a function from a number of particles to log weights, replayed as a CUDA graph unless `graphs` is None.
+
+    Args:
+        graphs: the graphs.
+        kind: name of the weights.
+        model: model that reads the batch.
+        batch: batch as in `DynamicalVAE.model`, a `Batch` on the GPU if there are graphs.
+        log_weights_of: function from the read batch and a number n of particles to log weights (n B,).
+    """
+
+    def weights(count: int) -> Tensor:
+        run = replayed(graphs, (kind, count), lambda each: {"weights": log_weights_of(model.read(each), count)})
+        return run(batch)["weights"].clone()  # the next replay overwrites them
+
+    return weights if graphs else partial(log_weights_of, model.read(batch))
 
 
 def importance_mean(
@@ -489,7 +524,7 @@ def importance_mean(
 
 def importance_weights(model: DynamicalVAE, data: AnyBatch, size: int, particles: int, chunk: int) -> Tensor:
     """Return K log weights log p(x, z) - log q(z | x) of each of B sequences, (K, B)."""
-    return _all_weights(partial(_repeated_weights, model, data, {}), size, particles, chunk)
+    return _all_weights(partial(_repeated_weights, model, {}, model.read(data)), size, particles, chunk)
 
 
 def _all_weights(log_weights_of: Callable[[int], Tensor], size: int, particles: int, chunk: int) -> Tensor:
@@ -498,7 +533,7 @@ def _all_weights(log_weights_of: Callable[[int], Tensor], size: int, particles: 
     return torch.cat([log_weights_of(count).unflatten(0, (count, size)) for count in counts])
 
 
-def _repeated_weights(model: DynamicalVAE, data: AnyBatch, options: Mapping[str, Any], count: int) -> Tensor:
+def _repeated_weights(model: DynamicalVAE, options: Mapping[str, Any], data: Batch, count: int) -> Tensor:
     return _log_weights(model, repeat(data, count), options)
 
 

@@ -30,17 +30,24 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
+from ...capture import Captured
 from ...data.batch import Batch
 from ...distributions.diffusion import DenoisingModule
 from ...program.batch import AnyBatch, repeat
 from ...program.model import DynamicalVAE
 from ...program.rollout import Sequence
-from .elbo import IWAEBound, importance_mean, log_densities, require_densities, sites_of, total
+from .elbo import IWAEBound, importance_mean, log_densities, replayed_weights, require_densities, sites_of, total
 
 
 @torch.no_grad()
 def predictive_bound(
-    model: DynamicalVAE, batch: AnyBatch, observed: int, particles: int = 100, *, chunk: int = 4096
+    model: DynamicalVAE,
+    batch: AnyBatch,
+    observed: int,
+    particles: int = 100,
+    *,
+    chunk: int = 4096,
+    graphs: Captured | None = None,
 ) -> IWAEBound:
     """Return a lower bound on the log density of the future under the model's forecast; see the module.
 
@@ -50,6 +57,7 @@ def predictive_bound(
         observed: O, number of observed steps.
         particles: K, number of particles.
         chunk: largest number of sequences times particles in memory.
+        graphs: CUDA graphs by which to replay the weights of a `Batch` on the GPU.
 
     Returns:
         The bound in nats per sequence, and the tail shape of the weights, (B,) each; NaN for a density by the ODE.
@@ -90,9 +98,9 @@ def predictive_bound(
                 "the view has one log-determinant for a whole sequence, so the part of the future is unknown; "
                 "omit the log score, or return log_det by entry, (B, T, D), from the view"
             )
-        past = data.map(lambda value: value[:, :observed] if value.dim() == 3 else value)
 
-        def log_weights(count: int) -> Tensor:
+        def log_weights(data: Batch, count: int) -> Tensor:
+            past = data.map(lambda value: value[:, :observed] if value.dim() == 3 else value)
             repeated = repeat(data, count)
             proposed = poutine.trace(model.guide).get_trace(repeated)
             joint = poutine.trace(poutine.replay(model.model, trace=proposed)).get_trace(repeated)
@@ -109,7 +117,8 @@ def predictive_bound(
             density = _ode_density(model, data, observed)
             result = IWAEBound(density, torch.full_like(density, math.nan), particles)
         else:
-            result = importance_mean(log_weights, size, particles, chunk)
+            weights = replayed_weights(graphs, "log score", model, batch if graphs else data, log_weights)
+            result = importance_mean(weights, size, particles, chunk)
         return replace(result, bound=result.bound + log_det[:, observed:].sum(1).to(result.bound))
 
 

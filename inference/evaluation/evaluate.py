@@ -89,7 +89,7 @@ def evaluate(
         options: further arguments of the models' `forecast`, such as {"temperature": 0} for futures at the mean of the
             prior.
         progress: whether to show a progress bar.
-        cuda_graph: on a CUDA GPU, whether to replay forecasts and the ELBO as CUDA graphs (`dvae.capture`). It has only
+        cuda_graph: on a CUDA GPU, whether to replay forecasts and bounds as CUDA graphs (`dvae.capture`). It has only
             been tested on a simulated GPU.
 
     Returns:
@@ -156,7 +156,7 @@ def evaluate(
                     cluster_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"), graphs)
             if each.likelihood or has_ode(each):
                 with seeded_evaluation(each, seed):
-                    cluster_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"))
+                    cluster_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"), graphs)
             equations = {"generative": each.generative.text, "inference": each.inference.text}
             rows[name] = Row(samples, cluster_scores, equations, dict((configs or {}).get(name, {})), histograms)
 
@@ -314,20 +314,21 @@ class _Evaluator:
             scores = dict(run(batch))
             steps = scores.pop("steps")
             if weighted:
-                iwae = iwae_bound(model, batch, particles=self.bound_particles)
+                iwae = iwae_bound(model, batch, particles=self.bound_particles, graphs=graphs)
                 scores |= {"IWAE bound": iwae.bound / steps, "k-hat": iwae.khat}
             refuse_non_finite(name, "bound", scores["ELBO"].isfinite(), self.eval_windows.keys[part])
             results.append({metric: values.cpu() for metric, values in scores.items()})
         return self._means(_concatenate(results))
 
-    def log_score(self, name: str, model: Any, parts: Iterator[slice]) -> dict[str, np.ndarray]:
+    def log_score(self, name: str, model: Any, parts: Iterator[slice], graphs: Captured | None) -> dict[str, np.ndarray]:
         """Return the log score by its name, in nats per predicted step, for each cluster; empty if not requested."""
         if not self.log_score_particles:
             return {}
         results = []
         for part in parts:
             batch = on_device_of(model, self.eval_windows.part(part))
-            bound = predictive_bound(model, batch, self.eval_windows.observed, self.log_score_particles).bound
+            options: Any = {"particles": self.log_score_particles, "graphs": graphs}
+            bound = predictive_bound(model, batch, self.eval_windows.observed, **options).bound
             refuse_non_finite(name, "log score", bound.isfinite(), self.eval_windows.keys[part])
             results.append({"log score": (bound / self.eval_windows.futures.shape[1]).cpu()})
         return self._means(_concatenate(results))

@@ -366,6 +366,20 @@ def test_replayed_forecasts_have_the_same_scores(name, small_method, monkeypatch
     assert len(replays) == kinds * (len(windows.keys) - WARM_UP)
 
 
+def test_replayed_bounds_and_log_scores_are_those_of_a_processor(monkeypatch):
+    model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2}).double()
+    windows = dvae.ArrayWindows(torch.randn(6, 8, 2), observed=3)
+    options = {"samples": 2, "batch_size": 1, "bound_particles": 30, "log_score_particles": 3, "references": False}
+    expected = dvae.evaluate(model, windows, **options, progress=False)["model"]
+    replays, replay = [], Tape.replay
+    monkeypatch.setattr(Tape, "replay", lambda tape: replays.append(replay(tape)))
+    with simulated_gpu():
+        result = dvae.evaluate(move(model), windows, cuda_graph=True, **options, progress=False)["model"]
+    for score in ("ELBO", "IWAE bound", "k-hat", "log score"):
+        assert result[score].mean == pytest.approx(expected[score].mean, 1e-9)
+    assert len(replays) == 4 * (6 - WARM_UP)  # forecasts too
+
+
 class TestCapturedStep:
     """Steps of a small model, replayed as a graph."""
 
