@@ -156,14 +156,14 @@ class Jax:
         g = self.lstm(p, f"{network}.memories.0", x[::-1])[::-1]
 
         def step(z: Any, known: Any) -> Any:
-            g, e = known
+            g, e, is_later = known
             f = tanh(self.dense(p, f"{network}.extractors.z.0", z))
-            f = tanh(self.dense(p, f"{network}.extractors.z.2", f))
+            f = is_later * tanh(self.dense(p, f"{network}.extractors.z.2", f))
             loc, scale = self.normal(p, "encoder.z", tanh(self.dense(p, f"{network}.join.first", 0.5 * (g + f))))
             z = loc + scale * e
             return z, (z, loc, scale)
 
-        z, *guide = self.lax.scan(step, self.np.zeros_like(noise[0]), (g, noise))[1]
+        z, *guide = self.lax.scan(step, self.np.zeros_like(noise[0]), (g, noise, self.np.arange(len(noise)) > 0))[1]
         network, previous = "generator.z.network", self.before(z)
         two = [
             self.dense(p, f"{network}.{each}.2", nn.relu(self.dense(p, f"{network}.{each}.0", previous)))
