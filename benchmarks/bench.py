@@ -223,28 +223,25 @@ def device_and_threads(record: dict[str, Any]) -> tuple[str, int]:
 def tabulate(records: list[dict[str, Any]], results: Path = RESULTS) -> None:
     """Write the table of the last number of each row in this version, and of the release; a GPU has its own table."""
     last = records[-1]
-    lines: dict[str, list[str]] = {}
-    commits: dict[str, set[str]] = {"Last": set(), "release": set()}
+    lines: dict[str, tuple[list[str], str, str]] = {}
     for n, each in enumerate(records):
         if (each["version"], device_and_threads(each)) != (last["version"], device_and_threads(last)):
             continue
         before = release_rows(records[: n + 1], each)
         for name, value in each["rows"].items():
-            side, bound = each["targets"].get(name, ("at most", None))
-            target = (
-                ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if meets(value, (side, bound)) else "no"]
-            )
-            release = f"{before[name][0]:.2f}" if name in before else "–"
-            change = f"{value / before[name][0]:.2f}" if name in before and side in COMPARED else "–"
-            lines[name] = [name, *target, f"{value:.2f}", release, change]
-        commits["Last"].add(f"{each['commit']} ({each['date']})")
-        commits["release"] |= {commit for _, commit in before.values()}
-    note = "; ".join(f"{kind}: {', '.join(sorted(names)) or 'none'}" for kind, names in commits.items()) + "."
+            target = side, bound = each["targets"].get(name, ("at most", None))
+            cells = ["", ""] if bound is None else [f"{side} {bound:g}", "yes" if meets(value, target) else "no"]
+            reference, commit = before.get(name, (None, ""))
+            release = "–" if reference is None else f"{reference:.2f}"
+            change = f"{value / reference:.2f}" if reference is not None and side in COMPARED else "–"
+            line = [name, *cells, f"{value:.2f}", release, change]
+            lines[name] = line, f"{each['commit']} ({each['date']})", commit
+    shown = [lines[name] for name in sorted(lines, key=_place) if not has_failed(name, last)]
+    commits = {kind: sorted({line[n] for line in shown} - {""}) for n, kind in ((1, "Last"), (2, "release"))}
+    note = "; ".join(f"{kind}: {', '.join(names) or 'none'}" for kind, names in commits.items()) + "."
     note += f" Failed: {', '.join(last['failed'])}." if last.get("failed") else ""
-    rows = [
-        line for name, line in sorted(lines.items(), key=lambda item: _place(item[0])) if not has_failed(name, last)
-    ]
-    history = Table(["", "target", "met", "last", "release", "last over release"], rows, note)
+    header = ["", "target", "met", "last", "release", "last over release"]
+    history = Table(header, [line for line, *_ in shown], note)
     write(results, {f"speed/{'history' if device_and_threads(last)[0] == 'cpu' else 'gpu-history'}": history})
 
 

@@ -1,14 +1,18 @@
 """Training steps of other implementations over ours, at equal sizes and shapes: `python -m benchmarks.bench peers`.
 
-    NAME, public     the code of Girin et al., https://github.com/XiaoyuBIE1994/DVAE, with its layer sizes for motion;
-                     the environment variable DVAE_PUBLIC_CODE names a clone of it
-    NAME, jax        the same model and loss as ours in JAX, with `lax.scan`, the whole step jitted; needs
-                     `pip install jax`
-    ..., graph       on a GPU: our step is replayed as a CUDA graph
-    ..., kernel      on a GPU: so it is, with the Triton kernel in its chain over time
+    NAME, public          the code of Girin et al., https://github.com/XiaoyuBIE1994/DVAE, with its layer sizes for
+                          motion and its loss, which has joint errors in place of our density; the environment variable
+                          DVAE_PUBLIC_CODE names a clone of it
+    NAME, public, limit   a step of the public code over its LSTM layers and matrix products alone, which both codes
+                          have: the largest possible ratio without faster layers
+    NAME, jax             the same model and loss as ours in JAX, with `lax.scan`, the whole step jitted; needs the
+                          package jax, on a GPU `jax[cuda]`
+    ..., graph            on a GPU: our step is replayed as a CUDA graph
+    ..., kernel           on a GPU: as `graph`, with the Triton kernel in our chain over time
 
 A step is loss, backward pass and Adam; ours is a step of `SVI`. Before the JAX code is timed, its loss is compared with
-ours for equal parameters and noise. Without clone or package, these rows are left out.
+ours for equal parameters and noise. On a GPU, JAX multiplies matrices in TF32, and torch in float32. Without clone or
+package, these rows are left out.
 """
 
 from __future__ import annotations
@@ -31,17 +35,18 @@ import dvae
 from dvae.distributions import chain
 
 from .graphs import step_of
-from .speed import BATCH, FAMILY, SIZE, STEPS, seconds, training_step
+from .speed import BATCH, FAMILY, SIZE, STEPS, layers, products, seconds, training_step
 
 LATENT = 10
 PUBLIC = {name: name.replace("-", "") for name in FAMILY if name != "kvae"}
 """Names of the public configurations, without separators; the KVAE is trained in three stages there."""
 MARKOV = ("srnn", "dkf")
 CHAINS = (*MARKOV, "vrnn", "rvae-causal", "rvae-noncausal")
-TARGETS: dict[str, tuple[str, float | None]] = {
-    f"{name}, {peer}": ("at least", None) for name in PUBLIC for peer in ("public", "jax")
-}
-TARGETS |= {f"{name}, public": ("at least", 1.35) for name in ("storn", "dsae")}
+LIMITED = ("storn", "dsae")
+TARGETS: dict[str, tuple[str, float | None]] = {f"{name}, public": ("at least", None) for name in PUBLIC}
+TARGETS |= {f"{name}, public": ("at least", 1.35) for name in LIMITED}
+TARGETS |= {f"{name}, public, limit": ("over", None) for name in LIMITED}
+TARGETS |= {f"{name}, jax": ("at least", None) for name in MARKOV}
 for kind in ("graph", "kernel"):
     TARGETS |= {f"{name}, public, {kind}": ("at least", 10.0 if name in CHAINS else 2.0) for name in PUBLIC}
     TARGETS |= {f"{name}, jax, {kind}": ("at least", 1.5) for name in MARKOV}
@@ -57,8 +62,8 @@ def load(path: Path) -> Any:
     return module
 
 
-def public_step(name: str, x: Tensor, code: Path) -> Callable[[], object]:
-    """Return a training step of the public code on x (B, T, D)."""
+def public(name: str, x: Tensor, code: Path) -> tuple[nn.Module, Callable[[], object]]:
+    """Return a model of the public code and a training step on x (B, T, D)."""
     (file,) = (
         path
         for path in (code / "config" / "motion").glob("cfg_*.ini")
@@ -79,22 +84,36 @@ def public_step(name: str, x: Tensor, code: Path) -> Callable[[], object]:
             total = total + losses.loss_KLD(*moments)
         return total / x.shape[:2].numel()
 
-    return training_step(model, loss)
+    return model, training_step(model, loss)
+
+
+def limit(name: str, x: Tensor, code: Path) -> float:
+    """Return the time of a step of the public code over the time of its LSTM layers and matrix products."""
+    model, step = public(name, x, code)
+    whole, lstms, others = seconds(step, layers(model, x.transpose(0, 1)), products(step))
+    return whole / (lstms + others)
 
 
 class Jax:
     """The SRNN and the DKF of `dvae.models.family` in JAX; parameters have the names and shapes of ours.
 
     Args:
+        name: name of the model.
         model: our model.
+        device: device of our model, which must be that of JAX.
+
+    Raises:
+        RuntimeError: JAX computes on another device.
     """
 
-    def __init__(self, name: str, model: nn.Module) -> None:
+    def __init__(self, name: str, model: nn.Module, device: torch.device) -> None:
         if torch.get_num_threads() == 1:
             os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
         import jax
 
+        if (backend := jax.default_backend()) != ("gpu" if device.type == "cuda" else device.type):
+            raise RuntimeError(f"JAX computes on {backend}, but torch on {device}; a GPU needs the package jax[cuda]")
         self.jax, self.np, self.lax = jax, jax.numpy, jax.lax
         self.terms = {"srnn": self.srnn, "dkf": self.dkf}[name]
         self.parameters = {key: self.array(value) for key, value in model.named_parameters()}
@@ -129,14 +148,14 @@ class Jax:
         loc, raw = self.np.split(self.dense(p, f"{name}.head.out", features), 2, axis=-1)
         return loc, self.jax.nn.softplus(raw) + 1e-3
 
-    def before(self, value: Any) -> Any:
+    def previous(self, value: Any) -> Any:
         """Return the values of the previous steps, zero at the first."""
         return self.np.concatenate([self.np.zeros_like(value[:1]), value[:-1]])
 
     def srnn(self, p: Mapping[str, Any], x: Any, noise: Any) -> tuple[Any, Any, Any]:
         """Return moments of the guide and of the prior, and the mean of x."""
         join, first, tanh = self.np.concatenate, "network.join.first", self.np.tanh
-        h = self.lstm(p, "generator.z.network.memories.0", self.before(x))
+        h = self.lstm(p, "generator.z.network.memories.0", self.previous(x))
         g = self.lstm(p, "encoder.z.network.memories.0", join([h, x], -1)[::-1])[::-1]
 
         def step(z: Any, known: Any) -> Any:
@@ -146,7 +165,7 @@ class Jax:
             return z, (z, loc, scale)
 
         z, *guide = self.lax.scan(step, self.np.zeros_like(noise[0]), (g, noise))[1]
-        prior = tanh(self.dense(p, f"generator.z.{first}", join([h, self.before(z)], -1)))
+        prior = tanh(self.dense(p, f"generator.z.{first}", join([h, self.previous(z)], -1)))
         features = tanh(self.dense(p, f"generator.x.{first}", join([h, z], -1)))
         return guide, self.normal(p, "generator.z", prior), self.dense(p, "generator.x.head.out", features)
 
@@ -164,12 +183,12 @@ class Jax:
             return z, (z, loc, scale)
 
         z, *guide = self.lax.scan(step, self.np.zeros_like(noise[0]), (g, noise, self.np.arange(len(noise)) > 0))[1]
-        network, previous = "generator.z.network", self.before(z)
-        two = [
+        network, previous = "generator.z.network", self.previous(z)
+        outputs = [
             self.dense(p, f"{network}.{each}.2", nn.relu(self.dense(p, f"{network}.{each}.0", previous)))
             for each in ("gate", "proposal")
         ]
-        gate, proposal = nn.sigmoid(two[0]), two[1]
+        gate, proposal = nn.sigmoid(outputs[0]), outputs[1]
         mean = (1 - gate) * self.dense(p, f"{network}.linear", previous) + gate * proposal
         variance = nn.softplus(self.dense(p, "generator.z.head.variance", nn.relu(proposal)))
         features = tanh(self.dense(p, "generator.x.network.join.first", z))
@@ -178,8 +197,8 @@ class Jax:
 
     def loss(self, p: Mapping[str, Any], x: Any, noise: Any) -> Any:
         """Return the negative ELBO in nats per frame, for x (T, B, D) and noise (T, B, Z)."""
-        (loc, scale), (before, prior_scale), mean = self.terms(p, x, noise)
-        ratio, distance = (scale / prior_scale) ** 2, ((loc - before) / prior_scale) ** 2
+        (loc, scale), (prior_loc, prior_scale), mean = self.terms(p, x, noise)
+        ratio, distance = (scale / prior_scale) ** 2, ((loc - prior_loc) / prior_scale) ** 2
         kl = 0.5 * (ratio + distance - 1 - self.np.log(ratio)).sum()
         log_scale = p["generator.x.head.log_scale"]
         log_likelihood = -(
@@ -221,20 +240,18 @@ def jax_step(name: str, x: Tensor) -> Callable[[], object]:
     Raises:
         ValueError: the losses differ.
     """
-    model, some = (
-        dvae.method(name, **FAMILY[name]).build({"x": SIZE}),
-        0.1 * x[:4].cpu(),
-    )  # so small that the divergence counts
-    code, drawn, original = Jax(name, model), list[Tensor](), chain.GaussianChain.apply
+    model = dvae.method(name, **FAMILY[name]).build({"x": SIZE})
+    few = 0.1 * x[:4].cpu()  # so small that the divergence counts
+    code, drawn, original = Jax(name, model, x.device), list[Tensor](), chain.GaussianChain.apply
 
     def draw(noise: Tensor, *others: Any) -> Any:
         drawn.append(noise)
         return original(noise, *others)
 
     with mock.patch.object(chain.GaussianChain, "apply", draw), torch.no_grad():
-        ours = dvae.Evidence()(dvae.SequenceELBO().terms(model, some), 0).item()
-    with code.jax.default_matmul_precision("highest"):  # a GPU computes in TF32 by default, also when timed
-        theirs = float(code.loss(code.parameters, code.array(some.transpose(0, 1)), code.array(drawn[0])))
+        ours = dvae.Evidence()(dvae.SequenceELBO().terms(model, few), 0).item()
+    with code.jax.default_matmul_precision("highest"):
+        theirs = float(code.loss(code.parameters, code.array(few.transpose(0, 1)), code.array(drawn[0])))
     if not math.isclose(theirs, ours, rel_tol=1e-5):
         raise ValueError(f"the loss of the JAX code is {theirs}, ours is {ours}")
     return code.step(x)
@@ -251,7 +268,7 @@ def ratio(name: str, other: Callable[[str, Tensor], Callable[[], object]], x: Te
 def rows(device: torch.device) -> dict[str, Callable[[], float]]:
     x, code = torch.randn(BATCH, STEPS, SIZE, device=device), os.environ.get("DVAE_PUBLIC_CODE")
     peers: dict[str, tuple[Any, Any]] = {
-        "public": (PUBLIC, partial(public_step, code=Path(code or ""))),
+        "public": (PUBLIC, lambda name, x: public(name, x, Path(code or ""))[1]),
         "jax": (MARKOV, jax_step),
     }
     if not code:
@@ -260,8 +277,11 @@ def rows(device: torch.device) -> dict[str, Callable[[], float]]:
     if not importlib.util.find_spec("jax"):
         print("  NAME, jax is left out: it needs the package jax", flush=True)
         del peers["jax"]
+    limits = {
+        f"{name}, public, limit": partial(limit, name, x, Path(code)) for name in LIMITED if code and not x.is_cuda
+    }
     kinds = {", graph": None, ", kernel": "cuda"} if device.type == "cuda" else {"": None}
-    return {
+    return limits | {
         f"{name}, {peer}{kind}": partial(ratio, name, step, x, kernel)
         for kind, kernel in kinds.items()
         for peer, (names, step) in peers.items()

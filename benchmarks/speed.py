@@ -2,6 +2,7 @@
 
     program   the Pyro training step of an SRNN over the same computation written by hand in torch
     chain     an SRNN training step with a plain loop over z_{t-1} over the fused one
+    mixed     an SRNN training step with `bf16-mixed` over one in float32
     cache     generation with the prefix recomputed at every step over generation with caches, Attention
     linear    seconds of a training step over T, Recurrent: the exponent of a power law
     segments  segments seen as time-stamped frames over forward kinematics of as many poses, on one core
@@ -260,6 +261,19 @@ def chain(x: Tensor) -> float:
     return a / b
 
 
+def mixed(x: Tensor) -> float:
+    """Return the time of an SRNN step with autocast to bfloat16 over one in float32."""
+    model = dvae.method("srnn", latent=10).build({"x": SIZE}).to(x.device)
+    elbo, evidence = dvae.SequenceELBO(), dvae.Evidence()
+
+    def loss() -> Tensor:
+        with torch.autocast(x.device.type, torch.bfloat16):
+            return evidence(elbo.terms(model, x), 0)
+
+    a, b = seconds(training_step(model, loss), step_of(model, x))
+    return a / b
+
+
 def cache(device: torch.device, length: int = 100, samples: int = 50) -> float:
     """Return the time of free-running generation without caches over the time with caches."""
     model = dvae.method("hit-dvae", pose_width=8).build({"x": SIZE}).to(device).eval()
@@ -393,6 +407,7 @@ def rows(device: torch.device) -> dict[str, Callable[[], float | dict[str, float
     parts: dict[str, Callable[[], float | dict[str, float]]] = {
         "program": lambda: program(x),
         "chain": lambda: chain(x),
+        "mixed": lambda: mixed(x),
         "cache": lambda: cache(device),
         "linear": lambda: linear(device),
     }

@@ -89,12 +89,12 @@ class Captured:
         self.obstacles = dict[Hashable, list[str]]()
         self.graphs = dict[Hashable, _Graph]()
         self._stream: Any = torch.cuda.Stream(device)
-        # one for all graphs, because the results of a call are read before the next one
+        # one for all graphs, because the results of a call are read or copied before the next one
         self._pool: Any = torch.cuda.graph_pool_handle()
         self._calls = Counter[Hashable]()
 
     def __call__(self, kind: Hashable, function: Function, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the results of the function; those of a graph are overwritten by its next replay.
+        """Return the results of the function; the next replay of any graph may overwrite those of a graph.
 
         Args:
             kind: value that determines the function's operations, except for the shapes and types of the inputs.
@@ -128,7 +128,7 @@ class Captured:
         return self.graphs[kind].replay(inputs)
 
     def checked(self, kind: Hashable, function: Function, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the results as a call does, of a function that may call `defer`.
+        """Return the results of a function that may call `defer`; no replay overwrites them.
 
         If a check fails, the function is called again with the same random numbers and without a graph, so that the
         check raises its error.
@@ -140,7 +140,7 @@ class Captured:
             return {**results, "failed": any_failed(checks, self.device)}
 
         random = torch.get_rng_state(), torch.cuda.get_rng_state(self.device)
-        results = dict(self(kind, record, inputs))
+        results = {name: value.clone() for name, value in self(kind, record, inputs).items()}
         if not results.pop("failed"):
             return results
         torch.set_rng_state(random[0])

@@ -7,7 +7,8 @@ each value on which the program synchronises.
 
 CUDA graphs are simulated too: `torch.cuda.graph` records the operations on the device, and a read or an upload is an
 error in it. A replay runs the same operations on the same tensors, so everything that Python decided in the recording
-stays as it was, as on a GPU.
+stays as it was, as on a GPU. It also overwrites the memory of graphs of the same pool that were recorded later, which
+may reuse what this graph has freed.
 
 A real GPU draws other random numbers than the CPU. Under `SameNoise` it uses the random numbers of the CPU, so results
 agree.
@@ -170,6 +171,7 @@ class Tape:
 
     def __init__(self) -> None:
         self.calls: list[tuple[Any, Any, Any, bool, list[Tensor]]] = []
+        self.pool: list[Tape] = [self]
         self._own: set[int] = set()  # storages that the recording allocates
         self._changed: dict[int, tuple[Tensor, Tensor]] = {}  # other storages that it writes to, and their values
 
@@ -203,11 +205,20 @@ class Tape:
 
     def replay(self) -> None:
         """Run the recorded operations again, with results in the recorded tensors."""
+        for later in self.pool[self.pool.index(self) + 1 :]:
+            later.spoil()
         for func, args, kwargs, is_training, recorded in self.calls:
             with no_dispatch(), torch.set_grad_enabled(is_training):  # oneDNN has other kernels in training
                 for before, now in zip(recorded, _tensors([func(*args, **kwargs)]), strict=True):
                     if now.data_ptr() != before.data_ptr():
                         before.copy_(now)
+
+    def spoil(self) -> None:
+        """Overwrite all memory that the recording has allocated, with NaN in floating-point numbers."""
+        for *_, recorded in self.calls:
+            for storage in map(Tensor.untyped_storage, recorded):
+                if storage.data_ptr() in self._own:
+                    storage.fill_(255)  # type: ignore[attr-defined]
 
 
 class _Moves(TorchFunctionMode):
@@ -299,8 +310,9 @@ def on_device() -> Iterator[Traffic]:
         traffic = stack.enter_context(Traffic())
 
         @contextmanager
-        def graph(tape: Tape, *_: Any, **__: Any) -> Iterator[None]:
-            traffic.tape, random_state = tape, torch.get_rng_state()
+        def graph(tape: Tape, pool: list[Tape], *_: Any, **__: Any) -> Iterator[None]:
+            pool.append(tape)
+            traffic.tape, tape.pool, random_state = tape, pool, torch.get_rng_state()
             try:
                 yield
             finally:
@@ -316,7 +328,7 @@ def on_device() -> Iterator[Traffic]:
             "current_stream": stream,
             "set_stream": stream,
             "graph": graph,
-            "graph_pool_handle": lambda: None,
+            "graph_pool_handle": list,
             "set_sync_debug_mode": traffic.set_sync_debug_mode,
             "get_sync_debug_mode": lambda: traffic.sync_debug_mode,
         }

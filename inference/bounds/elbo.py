@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -440,7 +440,7 @@ def iwae_bound(
         batch: batch as in `DynamicalVAE.model`.
         particles: K, number of particles.
         chunk: largest number of sequences times particles in memory.
-        graphs: CUDA graphs by which to replay the weights of a `Batch` on the GPU.
+        graphs: CUDA graphs that replay the weights; the batch must then be a `Batch` on the GPU.
         options: options of the program.
 
     Returns:
@@ -465,34 +465,37 @@ def iwae_bound(
             evidence = _log_weights(model, data, options)
             return IWAEBound(evidence, torch.full_like(evidence, math.nan if model.bounded else 0.0), particles)
         groups = Groups.of(data.group) if model.grouped and data.group is not None else None
-        weights = replayed_weights(
-            graphs, "IWAE bound", model, batch if graphs else data, partial(_repeated_weights, model, options)
-        )
+        kind = "IWAE bound", *sorted(options.items())
+        weights = replayed_weights(graphs, kind, model, batch, data, partial(_repeated_weights, model, options))
         return importance_mean(weights, size, particles, chunk, groups)
 
 
 def replayed_weights(
     graphs: Captured | None,
-    kind: str,
+    kind: Hashable,
     model: DynamicalVAE,
     batch: AnyBatch,
+    data: Batch,
     log_weights_of: Callable[[Batch, int], Tensor],
 ) -> Callable[[int], Tensor]:
     """Return a function from a number of particles to log weights, replayed as a CUDA graph unless `graphs` is None.
 
     Args:
         graphs: the graphs.
-        kind: name of the weights.
+        kind: value that determines `log_weights_of`, except for the number of particles.
         model: model that reads the batch.
         batch: batch as in `DynamicalVAE.model`, a `Batch` on the GPU if there are graphs.
+        data: the same batch, read by the model.
         log_weights_of: function from the read batch and a number n of particles to log weights (n B,).
     """
+    if graphs is None:
+        return partial(log_weights_of, data)
 
     def weights(count: int) -> Tensor:
         run = replayed(graphs, (kind, count), lambda each: {"weights": log_weights_of(model.read(each), count)})
-        return run(batch)["weights"].clone()  # the next replay overwrites them
+        return run(batch)["weights"]
 
-    return weights if graphs else partial(log_weights_of, model.read(batch))
+    return weights
 
 
 def importance_mean(

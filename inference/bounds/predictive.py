@@ -57,7 +57,7 @@ def predictive_bound(
         observed: O, number of observed steps.
         particles: K, number of particles.
         chunk: largest number of sequences times particles in memory.
-        graphs: CUDA graphs by which to replay the weights of a `Batch` on the GPU.
+        graphs: CUDA graphs that replay the weights; the batch must then be a `Batch` on the GPU.
 
     Returns:
         The bound in nats per sequence, and the tail shape of the weights, (B,) each; NaN for a density by the ODE.
@@ -117,7 +117,7 @@ def predictive_bound(
             density = _ode_density(model, data, observed)
             result = IWAEBound(density, torch.full_like(density, math.nan), particles)
         else:
-            weights = replayed_weights(graphs, "log score", model, batch if graphs else data, log_weights)
+            weights = replayed_weights(graphs, ("log score", observed), model, batch, data, log_weights)
             result = importance_mean(weights, size, particles, chunk)
         return replace(result, bound=result.bound + log_det[:, observed:].sum(1).to(result.bound))
 

@@ -17,6 +17,7 @@ from dvae.capture import WARM_UP, Captured
 from dvae.data.batch import Batch
 from dvae.distributions.chain import gaussian_chain
 from dvae.distributions.kalman import LinearGaussianChain
+from dvae.inference.bounds.predictive import predictive_bound
 from dvae.inference.evaluation.evaluation_windows import on_device_of
 from dvae.inference.training.checkpoints import Run
 from dvae.inference.training.resuming import restore, store
@@ -378,6 +379,35 @@ def test_replayed_bounds_and_log_scores_are_those_of_a_processor(monkeypatch):
     for score in ("ELBO", "IWAE bound", "k-hat", "log score"):
         assert result[score].mean == pytest.approx(expected[score].mean, 1e-9)
     assert len(replays) == 4 * (6 - WARM_UP)  # forecasts too
+
+
+def test_graphs_of_chunks_that_are_recorded_first_do_not_overwrite_the_bound():
+    model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2}).double()
+    windows = dvae.ArrayWindows(torch.randn(500, 4, 2), observed=2)
+    # ten chunks of 40 particles in each batch of 100
+    options = {"samples": 2, "batch_size": 100, "bound_particles": 400, "references": False, "progress": False}
+    expected = dvae.evaluate(model, windows, **options)["model"]
+    with simulated_gpu():
+        result = dvae.evaluate(move(model), windows, cuda_graph=True, **options)["model"]
+    for score in ("ELBO", "IWAE bound", "KL z"):
+        assert result[score].mean == pytest.approx(expected[score].mean, 1e-9)
+
+
+def test_a_log_score_has_a_graph_for_each_number_of_observed_steps():
+    model = dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t)", {"z": 1, "x": 2}).double()
+    x = torch.randn(3, 8, 2).double()
+    scores = []
+    for simulated in (False, True):
+        with simulated_gpu() if simulated else nullcontext():
+            model = move(model) if simulated else model
+            graphs = Captured("scores", OnDevice.device) if simulated else None
+            batch = Batch(x=x.to(OnDevice.device) if simulated else x)
+            for observed in (3, 5):
+                torch.manual_seed(0)
+                for _ in range(5):
+                    last = predictive_bound(model, batch, observed, 4, graphs=graphs).bound
+                scores.append(last.cpu())
+    torch.testing.assert_close(scores[2:], scores[:2])
 
 
 class TestCapturedStep:
