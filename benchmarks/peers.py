@@ -100,7 +100,7 @@ class Jax:
     Args:
         name: name of the model.
         model: our model.
-        device: device of our model, which must be that of JAX.
+        device: device of our model; JAX must compute on it.
 
     Raises:
         RuntimeError: JAX computes on another device.

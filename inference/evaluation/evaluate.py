@@ -320,7 +320,9 @@ class _Evaluator:
             results.append({metric: values.cpu() for metric, values in scores.items()})
         return self._means(_concatenate(results))
 
-    def log_score(self, name: str, model: Any, parts: Iterator[slice], graphs: Captured | None) -> dict[str, np.ndarray]:
+    def log_score(
+        self, name: str, model: Any, parts: Iterator[slice], graphs: Captured | None
+    ) -> dict[str, np.ndarray]:
         """Return the log score by its name, in nats per predicted step, for each cluster; empty if not requested."""
         if not self.log_score_particles:
             return {}
