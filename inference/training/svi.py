@@ -276,8 +276,9 @@ class SVI:
         self.any_flags = interrupted > 0, stopped > 0
         self._verdict(verdict, terms)
         if training.gradient_clip is not None and self._numbers[1] > training.gradient_clip:
+            factor = training.gradient_clip / numbers[1]
             for gradient in gradients:
-                gradient.mul_(training.gradient_clip / numbers[1])
+                gradient.mul_(factor)
         self._adapt(measured)
         for group in self.optimizer.param_groups:
             group["lr"] = rates["learning_rate"]
@@ -307,7 +308,7 @@ class SVI:
             self.fabric, self.parameters, loss, terms.n_steps.sum(), self.flags
         )
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
-        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]))
+        norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
         return gradients, torch.cat([torch.stack([loss.detach(), norm, total_loss + norm]), any_flags])
 
     def _verdict(self, numbers: list[float], terms: Terms) -> None:
