@@ -37,6 +37,7 @@ from dvae.distributions import chain
 from .graphs import step_of
 from .speed import BATCH, FAMILY, SIZE, STEPS, layers, products, seconds, training_step
 
+URL = "https://github.com/XiaoyuBIE1994/DVAE"
 LATENT = 10
 PUBLIC = {name: name.replace("-", "") for name in FAMILY if name != "kvae"}
 """Names of the public configurations, without separators; the KVAE is trained in three stages there."""
@@ -271,6 +272,8 @@ def rows(device: torch.device) -> dict[str, Callable[[], float]]:
         "public": (PUBLIC, lambda name, x: public(name, x, Path(code or ""))[1]),
         "jax": (MARKOV, jax_step),
     }
+    if code and not (Path(code) / "config" / "motion").is_dir():
+        raise ValueError(f"DVAE_PUBLIC_CODE is {code!r}, which has no folder config/motion; name a clone of {URL}")
     if not code:
         print("  NAME, public is left out: DVAE_PUBLIC_CODE must name a clone of the public code", flush=True)
         del peers["public"]

@@ -925,6 +925,9 @@ def test_peers_without_clone_and_package_are_left_out(monkeypatch, capsys):
     assert peers.rows(torch.device("cpu")) == {}
     assert "DVAE_PUBLIC_CODE must name a clone" in (printed := capsys.readouterr().out)
     assert "it needs the package jax" in printed
+    monkeypatch.setenv("DVAE_PUBLIC_CODE", "nowhere")
+    with pytest.raises(ValueError, match="is 'nowhere', which has no folder config/motion"):
+        peers.rows(torch.device("cpu"))
 
 
 def test_a_target_that_was_missed_before_is_reported_without_failure(benches):
