@@ -26,8 +26,6 @@ from .results import Table, ordered, tabled, write
 FORECASTS = 100
 REFERENCES = "autoregressive"
 """Case whose first seed also scores the simple forecasts."""
-DVAES = ("vae", "dkf", "storn", "vrnn", "srnn", "rvae-causal", "dsae", "kvae", "equations")
-"""Methods with latents."""
 COVERAGE = "coverage 90 %"
 SECTIONS = settings(__file__)
 

@@ -135,9 +135,9 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
     month = parts.get("month", 3 * parts["quarter"] - 2 if "quarter" in parts else np.ones(len(frame)))
     months = (12 * (parts["year"] - 1970) + month - 1).astype(int).astype("datetime64[M]")
     if "week" in parts:  # ISO week 1 contains January 4
-        fourth = months.astype("datetime64[D]") + 3
+        fourth = months.astype("datetime64[D]") + np.timedelta64(3, "D")
         weekday = (fourth.astype(int) + 3) % 7  # 1970 began on a Thursday
-        months = fourth - weekday + 7 * (parts["week"].astype(int) - 1)
+        months = fourth + (7 * (parts["week"].astype(int) - 1) - weekday).astype("timedelta64[D]")
     elif "day" in parts:
         if "month" in parts:
             _refuse_late_days(parts["day"], months, label)
@@ -147,7 +147,8 @@ def join_times(frame: Any, names: tuple[str, ...]) -> Any:
 
 
 def _refuse_late_days(days: np.ndarray, months: np.ndarray, label: str) -> None:
-    lengths = ((months + 1).astype("datetime64[D]") - months.astype("datetime64[D]")).astype(int)
+    following = months + np.timedelta64(1, "M")
+    lengths = (following.astype("datetime64[D]") - months.astype("datetime64[D]")).astype(int)
     if (days > lengths).any():
         row = int(np.argmax(days > lengths))
         raise ValueError(f"row {row} of {label} is not a date: {months[row]} has no day {days[row]:g}")

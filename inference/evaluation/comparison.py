@@ -8,6 +8,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from inspect import signature
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -341,9 +342,10 @@ class Comparison(Result):
     def to_elpd(self) -> dict[str, Any]:
         """Return the leave-future-out densities as `{name: ELPDData}`, for `arviz_stats.compare`.
 
-        `elpd_i` is the sum over the origins of each sequence, in nats, as a mean over seeds, and `n_eff_i` is the
-        effective sample size of the particles. The standard error assumes independent sequences and ignores seeds; the
-        errors of `difference` are clustered. `p` is NaN, because no parameter was fitted to these sequences.
+        `elpd_i` is the sum over the origins of each sequence, in nats, as a mean over seeds. `warning` is True if the
+        particles of a sequence have a small effective sample size. The standard error assumes independent sequences and
+        ignores seeds; the errors of `difference` are clustered. `p` is NaN, because no parameter was fitted to these
+        sequences.
 
         Raises:
             ValueError: when there are no leave-future-out densities.
@@ -351,18 +353,21 @@ class Comparison(Result):
         from arviz_stats.utils import ELPDData
         from xarray import DataArray
 
-        results = {}
+        results, size = {}, len(self.keys)
+        options: dict[str, Any] = {"p": math.nan, "scale": "log", "good_k": math.nan, "n_data_points": size}
+        if "kind" in signature(ELPDData).parameters:  # in versions of arviz_stats for Python 3.11
+            options["kind"] = "lfo"
         for name, row in self.rows.items():
             self.monte_carlo_error(name)  # raises without densities
-            size, particles = len(self.keys), row.bounds["LFO particles"].min(0)
-            by_sequence, effective = (
-                DataArray(values, {"sequence": self.labels()["sequence"]}, ("sequence",))
-                for values in (row.bounds["LFO"].mean(0), particles)
+            by_sequence = DataArray(row.bounds["LFO"].mean(0), {"sequence": self.labels()["sequence"]}, ("sequence",))
+            results[name] = ELPDData(
+                elpd=float(by_sequence.sum()),
+                se=float(by_sequence.std(ddof=1) * math.sqrt(size)),
+                n_samples=self.particles * REPLICATES,
+                warning=bool((row.bounds["LFO particles"].min(0) < EFFECTIVE).any()),
+                elpd_i=by_sequence,
+                **options,
             )
-            total, error = float(by_sequence.sum()), float(by_sequence.std(ddof=1) * math.sqrt(size))
-            few, draws = bool((particles < EFFECTIVE).any()), self.particles * REPLICATES
-            arrays: Any = {"elpd_i": by_sequence, "n_eff_i": effective}
-            results[name] = ELPDData("lfo", total, error, math.nan, draws, size, "log", few, math.nan, **arrays)
         return results
 
     def to_arviz(self) -> dict[str, Any]:

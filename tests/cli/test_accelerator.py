@@ -60,6 +60,7 @@ def test_a_command_computes_the_same_on_a_gpu(name, words, tmp_path, monkeypatch
     command = [words.get(word, word) for word in command.split()]
     assert main([*command, "--out", str(tmp_path / f"cpu.{suffix}")]) == 0
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.accelerator, "current_accelerator", lambda *_, **__: None)  # optimisers query its stream
     monkeypatch.setattr(torch.nn.Module, "to", lambda module, _: move(module))
     replays, replay = [], Tape.replay
     monkeypatch.setattr(Tape, "replay", lambda tape: replays.append(replay(tape)))
