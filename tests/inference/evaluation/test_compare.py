@@ -118,6 +118,8 @@ def test_leave_future_out_is_compared_next_to_the_evidence(fitted):
     assert result.n_forecast.tolist() == [T - 2] * 24
     elpd = result.to_elpd()
     assert elpd["dkf"].elpd == pytest.approx(24 * (T - 2) * result["dkf"]["LFO"].mean)
+    np.testing.assert_allclose(elpd["dkf"].elpd_i, result.rows["dkf"].bounds["LFO"].mean(0))
+    assert elpd["dkf"].se == pytest.approx(24**0.5 * elpd["dkf"].elpd_i.std(ddof=1).item())
     assert not elpd["dkf"].warning
     assert arviz_stats.compare(elpd).index[0] == max(elpd, key=lambda name: elpd[name].elpd)
     text = str(result)
@@ -131,6 +133,8 @@ def test_leave_future_out_is_compared_next_to_the_evidence(fitted):
     for missing in (without.to_elpd, lambda: without.monte_carlo_error("dkf")):
         with pytest.raises(ValueError, match="leave_future_out="):
             missing()
+    result.rows["dkf"].bounds["LFO particles"][0, 3] = 1
+    assert result.to_elpd()["dkf"].warning
 
 
 # --------------------------------------------------------------------------------------------------- standard errors
