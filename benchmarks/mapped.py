@@ -77,7 +77,7 @@ def anonymous(process: int) -> int:
 def peak_memory(data: Path, *options: str) -> int:
     """Return the peak anonymous memory of a fit to a file, in bytes."""
     with tempfile.TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "dvae.cli", "fit", "srnn", "--data", str(data), "--out", f"{out}/run"]
+        command = [sys.executable, "-m", "dvae", "fit", "srnn", "--data", str(data), "--out", f"{out}/run"]
         command += ["--steps", "20", "--batch-size", str(BATCH), *options]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         peak = 0

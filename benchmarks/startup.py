@@ -15,10 +15,10 @@ import torch
 
 TORCH = ("-c", "import torch")
 COMMANDS = {
-    "dvae --help": ("-m", "dvae.cli", "--help"),
-    "an unknown command": ("-m", "dvae.cli", "fitt"),
-    "dvae list": ("-m", "dvae.cli", "list"),
-    "dvae fit vae --help": ("-m", "dvae.cli", "fit", "vae", "--help"),
+    "dvae --help": ("-m", "dvae", "--help"),
+    "an unknown command": ("-m", "dvae", "fitt"),
+    "dvae list": ("-m", "dvae", "list"),
+    "dvae fit vae --help": ("-m", "dvae", "fit", "vae", "--help"),
     "import dvae": ("-c", "import dvae"),
 }
 TARGETS = {
@@ -47,7 +47,7 @@ def first_step(*options: str) -> float:
     """
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        command = [sys.executable, "-m", "dvae.cli", "fit", "srnn", "--out", f"{folder}/run", *options]
+        command = [sys.executable, "-m", "dvae", "fit", "srnn", "--out", f"{folder}/run", *options]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
         duration = time.perf_counter() - start
     if result.returncode:

@@ -30,6 +30,7 @@ LAYERS = {
     "dvae.testing": 8,
     "dvae.cli": 9,
     "dvae.command": 10,
+    "dvae.__main__": 10,
 }
 # Only motion itself, and the methods and commands for motion, import it.
 MOTION = re.compile(

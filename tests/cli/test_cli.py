@@ -598,7 +598,7 @@ def test_debug_prints_the_traceback(capsys, tmp_path):
 
 def test_ctrl_c_leaves_a_run_that_resumes(people, tmp_path):
     run = tmp_path / "run"
-    command = [sys.executable, "-m", "dvae.cli", "fit", "vae", "--data", str(people), "--out", str(run)]
+    command = [sys.executable, "-m", "dvae", "fit", "vae", "--data", str(people), "--out", str(run)]
     process = subprocess.Popen(
         [*command, "--steps", "100000", *SMALL], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

@@ -289,7 +289,7 @@ def states(out):
 def test_a_sweep_stopped_by_ctrl_c_is_resumed(people, tmp_path, capsys):
     """The signal goes to all processes, as from a terminal: all end, and runs resume from checkpoints."""
     arguments = ["sweep", "vae", "vrnn", "--seeds", "0", "1", "--data", str(people), "--out", str(tmp_path)]
-    command = [sys.executable, "-m", "dvae.cli", *arguments, "--steps", "30", *SMALL]
+    command = [sys.executable, "-m", "dvae", *arguments, "--steps", "30", *SMALL]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
