@@ -10,13 +10,16 @@ A `Row` combines the measurements of several seeds. Scripts define the columns o
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import json
+import os
 import sys
 import time
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -185,8 +188,20 @@ class Row:
         return spread([run.get(name) for run in self.runs])
 
 
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Wait until no other process holds the lock of a folder, and hold it (Linux and macOS)."""
+    path.mkdir(parents=True, exist_ok=True)
+    number = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(number)
+
+
 class Archive:
-    """Measurements by name in one zip file; equal measurements give equal bytes."""
+    """Measurements by name in one zip file; equal measurements give equal bytes, and processes may add at once."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -208,15 +223,16 @@ class Archive:
     def add(self, name: str, measurement: Mapping[str, Any]) -> None:
         """Add a measurement, whose `clips` map each clip to its number of windows."""
         contents = {name: json.dumps(measurement, separators=(",", ":")).encode()}
-        if self.file.exists():
-            with zipfile.ZipFile(self.file) as archive:
-                contents = {name: archive.read(name) for name in archive.namelist()} | contents
-        with (
-            files.atomic_write(self.file) as new,
-            zipfile.ZipFile(new, "w", zipfile.ZIP_LZMA) as out,
-        ):
-            for name in sorted(contents):
-                out.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_LZMA)
+        with locked(self.file.parent):
+            if self.file.exists():
+                with zipfile.ZipFile(self.file) as archive:
+                    contents = {name: archive.read(name) for name in archive.namelist()} | contents
+            with (
+                files.atomic_write(self.file) as new,
+                zipfile.ZipFile(new, "w", zipfile.ZIP_LZMA) as out,
+            ):
+                for name in sorted(contents):
+                    out.writestr(zipfile.ZipInfo(name), contents[name], zipfile.ZIP_LZMA)
 
 
 def read(path: Path, cases: Iterable[str], file: str = MEASURED) -> dict[str, Row]:

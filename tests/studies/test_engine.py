@@ -1,5 +1,7 @@
 """Shared code of studies: rows over seeds, stored measurements, and archives."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,13 @@ def test_an_archive_has_the_same_bytes_for_the_same_measurements(tmp_path):
         assert engine.Row([read], "y").values("ADE").tolist() == [[1.0]]
         assert (read["clips"], read["weights"]) == (["a"], [2])
     assert archives[0].file.read_bytes() == archives[1].file.read_bytes()
+
+
+def test_processes_add_to_one_archive_at_once(tmp_path):
+    names = [*"abcdefgh"]
+    with ThreadPoolExecutor(len(names)) as pool:
+        list(pool.map(lambda name: engine.Archive(tmp_path / "scores.zip").add(name, {"clips": {"a": 2}}), names))
+    assert engine.Archive(tmp_path / "scores.zip").names == names
 
 
 def test_settings_have_tuples_at_every_depth(tmp_path):
