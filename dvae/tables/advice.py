@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .calendar import FEATURES, FLAG, Calendar, functions_of_time
+from .calendar import EVEN, FEATURES, FLAG, Calendar, functions_of_time
 from .columns import ROUNDED, Column
-from .encoding import EVEN
 from .numerals import resolution
 from .panel import Panel, Series
 from .protocol import Cut
@@ -27,8 +26,8 @@ SAME, SAME_CHANGE = 0.999, 0.95
 
 Both are required, since all columns with a trend have similar ranks.
 """
-FEW = 0.1
-"""Share of longer steps below which rows are absent, and above which the steps are uneven by nature."""
+MINORITY = 0.5
+"""Share of longer steps below which rows may be absent, and above which the steps are uneven by nature."""
 CONTRAST = 10.0
 """Ratio of scales or levels of sequences above which they differ."""
 LONG = 8
@@ -60,7 +59,7 @@ def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
         *_spikes(columns, values),
         *_split(panel, cut, guessed),
         *_season(panel, cut),
-        *(() if panel.columns.lags else _absent(times)),  # with lags, the schema warns
+        *(() if panel.columns.lags else _absent(times, panel.calendar)),  # with lags, the schema warns
         *dated,
         *_leaks(*compared),
         *_scales(columns, sequences),
@@ -111,7 +110,7 @@ def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:
 
 
 def _season(panel: Panel, cut: Cut) -> Iterator[str]:
-    usual = panel.calendar.usual_season
+    usual = panel.usual_season
     if cut.season is None and 0 < usual <= (cut.observed or 0):
         yield (
             "models are not compared with a seasonal forecast, because no season is given; with such dates it is often "
@@ -119,14 +118,15 @@ def _season(panel: Panel, cut: Cut) -> Iterator[str]:
         )
 
 
-def _absent(times: Sequence[np.ndarray]) -> Iterator[str]:
-    """Yield a sentence if few steps are longer than all others, so that rows are absent."""
-    gaps = np.concatenate([np.empty(0), *map(np.diff, times)])
+def _absent(times: Sequence[np.ndarray], calendar: Calendar) -> Iterator[str]:
+    """Yield a sentence if the minority of the steps are longer than all others, so that rows may be absent."""
+    gaps = np.concatenate([np.empty(0), *map(calendar.gaps, times)])
     is_long = gaps > EVEN * np.median(gaps) if len(gaps) else np.zeros(1, bool)
-    if 0 < is_long.mean() < FEW and gaps[~is_long].max() <= EVEN * gaps.min():
+    if 0 < is_long.mean() < MINORITY and gaps[~is_long].max() <= EVEN * gaps.min():
         yield (
-            f"{is_long.sum()} steps are longer than the others, so the table counts as uneven, and a horizon counts "
-            "rows; if rows are absent, insert them with empty cells, for example by pandas' asfreq"
+            f"{is_long.sum()} steps are longer than the others, so the table counts as uneven, a horizon counts rows, "
+            "and forecasts have even times; if rows are absent, insert them with empty cells, for example by pandas' "
+            "asfreq"
         )
 
 

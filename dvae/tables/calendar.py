@@ -35,13 +35,20 @@ days would need 24, 12 or 366 coefficients, more than short tables determine.
 HARMONICS = 2
 FLAG = 20
 """Maximum number of distinct values of a flag or category."""
+EVEN = 1.3
+"""Maximum ratio of longest gap to median, and of median to shortest gap, of evenly spaced steps; months are even."""
+FEW = 0.1
+"""Share of longer steps below which single rows are absent; nights or weekends have more."""
 USUAL_SEASONS = {"1D": 7, "1B": 5, "1MS": 12, "1ME": 12, "1BMS": 12, "1BME": 12}
 """Steps in a week of daily data, and in a year of monthly data."""
 LINEAR = 1e-5
 """Distance from 1 of the correlation with time, below which a column is a linear function of it."""
 _OFFSET = re.compile(r"(?:UTC)?[-+](?:[01]\d|2[0-3]):[0-5]\d", re.ASCII)
 _DAYS = ("MON", "TUE", "WED", "THU", "FRI", "SAT", "SUN")
-_STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4](?:{'|'.join(_DAYS)}))", re.ASCII)
+_DAY = f"(?:{'|'.join(_DAYS)})"
+_STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4]{_DAY})|{_DAY}(?:-{_DAY}){{1,5}}", re.ASCII)
+WEEKS = 3
+"""Minimum number of weeks that show which days of the week have rows."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,8 @@ class Calendar:
     Args:
         kind: "numbers", "dates" (times are seconds since 1970, in UTC) or "durations" (times are seconds).
         zone: time zone of the dates, such as "Europe/Berlin" or "UTC+02:00"; None for dates without one.
-        step: calendar step as a pandas alias, such as "1MS" or "1B"; None for steps of equal duration.
+        step: calendar step as a pandas alias, such as "1MS" or "1B", or the days of the week that have rows, such as
+            "MON-WED-FRI"; None for steps of equal duration.
         gap: median time between two steps, used to continue a sequence of one step; 0 if unknown.
 
     Raises:
@@ -69,7 +77,9 @@ class Calendar:
         if self.zone is not None:
             check_zone(self.zone)
         if self.step is not None and not _STEP.fullmatch(self.step):
-            raise ValueError(f"step is {brief(self.step)}; expected a calendar step such as '1MS', '1B' or '7D'")
+            raise ValueError(
+                f"step is {brief(self.step)}; expected a calendar step such as '1MS', '1B', '7D' or 'MON-WED-FRI'"
+            )
         if self.kind != "dates" and (self.zone or self.step):
             raise ValueError(f"zone is {self.zone!r} and step {self.step!r}, but times are {self.kind}, not dates")
 
@@ -81,8 +91,16 @@ class Calendar:
     @property
     def usual_season(self) -> int:
         """Number of steps in a week of daily, a day of hourly, or a year of monthly dates; 0 for other times."""
-        hourly = self.kind == "dates" and self.step is None and self.gap == HOUR
-        return 24 if hourly else USUAL_SEASONS.get(self.step or "", 0)
+        if self.kind == "dates" and self.step is None and self.gap == HOUR:
+            return 24
+        step = self.step or ""
+        return step.count("-") + 1 if step.startswith(_DAYS) else USUAL_SEASONS.get(step, 0)
+
+    @property
+    def skips_days(self) -> bool:
+        """Whether some days of the week have no rows."""
+        step = self.step or ""
+        return step.endswith("B") or step.startswith(_DAYS)
 
     def stepping(self, times: Iterable[np.ndarray | None]) -> Self:
         """Return the calendar with the most common calendar step of sequences of times, and their median gap."""
@@ -119,7 +137,8 @@ class Calendar:
         calendar step continue by their median gap.
 
         Warns:
-            UserWarning: if some days last 23 or 25 hours, but the time zone has no clock changes.
+            UserWarning: if some days last 23 or 25 hours, but the time zone has no clock changes; or if many steps of
+                dates are longer than the others, as over closing hours, and are not continued so.
         """
         import pandas as pd
 
@@ -130,7 +149,9 @@ class Calendar:
             steps = (self.step, inferred) if is_daily else (inferred, self.step)
             for step in filter(None, steps):
                 if (following := _following(local, step, count)) is not None:
+                    replace(self, step=step)._warn_of_breaks(times)
                     return self._seconds(following)
+            replace(self, step=None)._warn_of_breaks(times)
             if len(local) > 1 and _is_daily(local):  # regardless of clock changes
                 gap = (local[1:] - local[:-1]).to_series().median()
                 return self._seconds(pd.DatetimeIndex([local[-1] + gap * number for number in range(1, count + 1)]))
@@ -143,6 +164,26 @@ class Calendar:
                 )
         gap = np.median(np.diff(times)) if len(times) > 1 else self.gap or 1.0
         return np.asarray(times[-1] + gap * np.arange(1, count + 1))
+
+    def _warn_of_breaks(self, times: np.ndarray) -> None:
+        if self.has_breaks(times):
+            warnings.warn(
+                f"many steps up to {self.text(times[-1])} are longer than the others, as over closing hours, but "
+                "forecasts have even times; for other times, append rows with them and empty targets, or insert the "
+                "absent rows with empty cells, for example by pandas' asfreq",
+                stacklevel=3,
+            )
+
+    def has_breaks(self, times: np.ndarray) -> bool:
+        """Return whether many steps between times (T,) are longer than the others, as over closing hours."""
+        gaps = self.gaps(times)
+        n_long = int((gaps > EVEN * np.median(gaps)).sum()) if len(gaps) else 0
+        return n_long >= WEEKS and n_long >= FEW * len(gaps)
+
+    def gaps(self, times: np.ndarray) -> np.ndarray:
+        """Return the steps between times (T,), (T - 1,): in calendar steps if all dates follow them, else in time."""
+        grid = _grid(self.local(times), self.step) if self.step and len(times) > 1 else None
+        return np.diff(times if grid is None else grid[0])
 
     def features(self, times: np.ndarray, names: Iterable[str]) -> np.ndarray:
         """Return calendar features (T, C) of dates (T,), at the local time of their zone.
@@ -278,7 +319,11 @@ def _step(local: Any) -> str | None:
         candidates = [f"{count}{end}" for end in ("ME", "BME", "MS", "BMS")]
         candidates.append(f"{count}WOM-{min((first.day + 6) // 7, 4)}{_DAYS[first.weekday()]}")
     else:
-        candidates = ["1B"] if days == 1 and (np.diff(local.day_of_week) < 0).any() else []
+        weekdays = local.day_of_week
+        candidates = ["1B"] if days == 1 and (np.diff(weekdays) < 0).any() else []
+        open_days = [name for number, name in enumerate(_DAYS) if (weekdays == number).any()]
+        if local[-1] - local[0] >= WEEKS * np.timedelta64(7, "D") and 1 < len(open_days) < 7:
+            candidates = candidates if open_days == [*_DAYS[:5]] else ["-".join(open_days)]
     candidates.append(f"{round(days)}D")
     valid = (step for step in candidates if _STEP.fullmatch(step))
     return next((step for step in valid if _following(local, step, 1) is not None), None)
@@ -288,16 +333,30 @@ def _following(local: Any, step: str, count: int) -> Any:
     """Return the next `count` dates by a calendar step; None if most given dates are not one such step apart."""
     import pandas as pd
 
-    days = None
+    grid = _grid(local, step)
+    if grid is None or (len(local) > 1 and np.median(np.diff(grid[0])) != 1):
+        return None
+    _, last, frequency, days = grid
+    following = pd.date_range(last, periods=count + 1, freq=frequency)[1:]
+    return (
+        following if days is None else following + pd.to_timedelta(np.minimum(days, following.days_in_month) - 1, "D")
+    )
+
+
+def _grid(local: Any, step: str) -> tuple[np.ndarray, Any, Any, int | None] | None:
+    """Return the positions of dates in steps, the last date, the pandas frequency, and the day of the month, if any.
+
+    None if some dates do not follow the step. The last date is the first of its month if the day is given.
+    """
+    import pandas as pd
+
+    days, frequency = None, step
+    if step.startswith(_DAYS):
+        frequency = pd.offsets.CustomBusinessDay(weekmask=step.replace("-", " ").title())
     if step.endswith("MS") and "B" not in step:  # months from any day: the 15th, or the 30th and the end of February
         days = local.day.max()
         if (local.day != np.minimum(days, local.days_in_month)).any():
             return None
         local = local - pd.to_timedelta(local.day - 1, unit="D")
-    indices = pd.date_range(local[0], local[-1], freq=step).get_indexer(local)
-    if indices[0] != 0 or (indices < 0).any() or (len(local) > 1 and np.median(np.diff(indices)) != 1):
-        return None
-    following = pd.date_range(local[-1], periods=count + 1, freq=step)[1:]
-    return (
-        following if days is None else following + pd.to_timedelta(np.minimum(days, following.days_in_month) - 1, "D")
-    )
+    positions = pd.date_range(local[0], local[-1], freq=frequency).get_indexer(local)
+    return None if positions[0] != 0 or (positions < 0).any() else (positions, local[-1], frequency, days)

@@ -41,15 +41,13 @@ from ..distributions.base import DistributionSpec
 from ..distributions.family import FAMILIES
 from ..distributions.product import Product
 from ..options import Amount, Positive, Range, require, tuples
-from .calendar import FEATURES, NUMBERS, Calendar
+from .calendar import EVEN, FEATURES, NUMBERS, Calendar
 from .columns import WHOLE_STEPS, Column, Columns
 from .panel import COUNTS, Panel, Series
 from .protocol import Cut
 
 COVARIATES, STATICS, GAPS, LEVELS_OF_COUNTS = "c", "s", "d", "r"
 """Names of context in batches."""
-EVEN = 1.3
-"""Maximum ratio of longest gap to median, and of median to shortest gap, of evenly spaced steps; months are even."""
 LEAST = 1e-7
 """Standard deviation of logarithms below which values count as constant up to rounding errors."""
 CENTRED = ("real", "fixed", "robust", "laplace", "mixture", "correlated")
@@ -215,7 +213,7 @@ class PanelSchema(Schema):
         )
         median = float(np.median(gaps)) if len(gaps) else 0.0
         step = median if len(gaps) and (gaps.max() > EVEN * median or median > EVEN * gaps.min()) else 0.0
-        if step and panel.columns.lags and not (panel.calendar.step or "").endswith("B"):  # weekends are no gaps
+        if step and panel.columns.lags and not panel.calendar.skips_days:  # weekends are no gaps
             warnings.warn(
                 f"{panel.name} has uneven steps, and lags count rows: a lag of {panel.columns.lags[0]} rows is not "
                 "always the same time; add the missing rows, with empty targets, if that matters",

@@ -27,7 +27,7 @@ from ..data.blocks import hash_values, ranges, row_blocks
 from ..data.npy import is_mapped
 from ..data.sequences import check_real
 from ..options import nearest
-from .calendar import NUMBERS, Calendar
+from .calendar import NUMBERS, SERIES, Calendar
 from .clocks import time_of
 from .column_inference import LARGEST, TIMES, ColumnHints, is_date
 from .columns import Column, Columns
@@ -133,6 +133,13 @@ class Panel:
         if any(column.rounding == "auto" for column in self.columns.columns):
             object.__setattr__(self, "columns", self._with_rounding())
         object.__setattr__(self, "complete", self._check())
+
+    @property
+    def usual_season(self) -> int:
+        """`Calendar.usual_season`; 0 if some of the first sequences have breaks, as over closing hours."""
+        times = [sequence.times for sequence in self.series[:SERIES] if sequence.times is not None]
+        season = self.calendar.usual_season
+        return 0 if season and any(map(self.calendar.has_breaks, times)) else season
 
     def _with_rounding(self) -> Columns:
         """Return the columns with the unit of their values in place of "auto"."""

@@ -196,8 +196,8 @@ class PanelWindows:
 
     @property
     def usual_season(self) -> int:
-        """Usual season of tables with these steps, as `Calendar.usual_season`."""
-        return self.panel.calendar.usual_season
+        """Usual season of tables with these steps, as `Panel.usual_season`."""
+        return self.panel.usual_season
 
     @property
     def families(self) -> list[str]:

@@ -23,7 +23,12 @@ def found(values, columns=None, cut=None, times=None, guessed=False, kind="dates
     names = [f"x{n}" for n in range(values.shape[2])]
     columns = columns or tuple(map(Column, names))
     steps = DAY * np.arange(values.shape[1]) if times is None else times
-    panel = Panel([Series(str(n), x, steps) for n, x in enumerate(values)], Columns(columns), "table", Calendar(kind))
+    panel = Panel(
+        [Series(str(n), x, steps) for n, x in enumerate(values)],
+        Columns(columns),
+        "table",
+        Calendar(kind).stepping([steps]),
+    )
     return findings(panel, cut or Cut(3, 1, split="time"), guessed)
 
 
