@@ -54,6 +54,11 @@ class View:
     """Quantity that densities refer to, if it is not the data as given; bounds of different quantities differ."""
 
     @property
+    def quantity(self) -> str:
+        """Quantity that densities refer to, `measured` at the steps after those of `past`; "" for the data as given."""
+        return ", ".join(filter(None, [self.measured, later_steps(self.past)]))
+
+    @property
     def by_step(self) -> bool:
         """Whether each step is transformed alone, so that sequences can grow step by step; a subclass declares it."""
         return type(self) is View
@@ -450,6 +455,11 @@ GIVEN = "given"
 """Name of the batch entry (B, T, D) that is True or 1 where an entry of x is given."""
 
 
+def later_steps(observed: int) -> str:
+    """Return words for the steps after the given ones; "" if none is given."""
+    return f"steps after the first {observed} given the first {observed}" if observed else ""
+
+
 def given_entries(data: Batch, observed: int | None) -> Tensor:
     """Return True at the given entries (B, T, D) of x, which are observed and neither missing nor padding.
 
@@ -490,7 +500,7 @@ class Given(View):
     @property
     def measured(self) -> str:  # type: ignore[override]
         """Quantity that densities refer to: all entries if none is given."""
-        return "" if self.observed is None else f"steps after the first {self.observed} given the first {self.observed}"
+        return later_steps(self.observed or 0)
 
     @override
     def check(self, sizes: Mapping[str, int], context: Collection[str], generative: Factorization) -> None:

@@ -544,7 +544,8 @@ class StepDenoiser(nn.Module):
 
 def embed_level(angle: Tensor) -> Tensor:
     """Return sines and cosines (..., 8) of multiples of the log signal-to-noise ratio of angles (..., 1)."""
-    ratio = torch.log(angle.tan().clamp(1e-4, 1e4)) / math.log(1e4) * (math.pi / 4)
+    tangent = angle.tan().abs()  # negative for pi / 2, whose float32 is above pi / 2
+    ratio = torch.log(tangent.clamp(1e-4, 1e4)) / math.log(1e4) * (math.pi / 4)
     return torch.cat([f(k * ratio) for k in FREQUENCIES for f in (torch.sin, torch.cos)], -1)
 
 

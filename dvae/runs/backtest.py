@@ -22,6 +22,7 @@ from ..inference.evaluation.evaluate import evaluate
 from ..inference.evaluation.evaluation import Evaluation
 from ..inference.evaluation.record import MODELS, Dims
 from ..inference.evaluation.result import PlainConsole, Table
+from ..inference.evaluation.scores import pseudo_values
 from ..inference.training.options import Training
 from ..models.method import Method
 from ..options import Count, nearest, require
@@ -68,7 +69,10 @@ class Backtest(Evaluation):
         kept = self.windows[place] > 0
         rows = {
             method: replace(
-                self.rows[method], histograms={}, cluster_means={n: v[place, kept] for n, v in scores.items()}
+                self.rows[method],
+                histograms={},
+                counts={},
+                cluster_means={n: v[place, kept] for n, v in scores.items()},
             )
             for method, scores in self.by_cutoff.items()
         }
@@ -221,20 +225,40 @@ def pool(evaluations: Mapping[str, Evaluation], fitted: str) -> Backtest:
                 values[[place[cluster] for cluster in each.clusters]] = part[name]
         return stacked
 
-    def pooled(values: np.ndarray) -> np.ndarray:
-        """Return means (C, ...) over cutoffs of values (cutoffs, C, ...), weighted by windows, without unknown ones."""
-        weights = windows.reshape(*windows.shape, *[1] * (values.ndim - 2)) * ~np.isnan(values)
-        with np.errstate(invalid="ignore"):
-            means: np.ndarray = (weights * np.nan_to_num(values)).sum(0) / weights.sum(0)
-        return means
+    def pooled(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """Return `pseudo_values` (C, ...) over all cutoffs of those of each cutoff (cutoffs, C, ...).
+
+        Args:
+            values: pseudo-values.
+            counts: numbers of windows with a score (cutoffs, C).
+        """
+        known, values = ~np.isnan(values), np.nan_to_num(values)
+        all_windows, counts = (each.reshape(*windows.shape, *[1] * (values.ndim - 2)) for each in (windows, counts))
+        all_windows, counts = all_windows * known, counts * known
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = (all_windows * values).sum(1, keepdims=True) / all_windows.sum(1, keepdims=True)
+            share = counts.sum(1, keepdims=True) / all_windows.sum(1, keepdims=True)
+        sums = np.where(counts > 0, share * all_windows * (values - ratio) + ratio * counts, 0.0).sum(0)
+        return pseudo_values(sums, counts.sum(0), windows.sum(0))
 
     rows, by_cutoff = {}, {}
     for method in [name for name in first.rows if all(name in each.rows for each in results)]:
         of_method = [each.rows[method] for each in results]
         by_cutoff[method] = stack([row.cluster_means for row in of_method])
         histograms = stack([row.histograms for row in of_method])
-        means, shares = ({n: pooled(v) for n, v in each.items()} for each in (by_cutoff[method], histograms))
-        rows[method] = replace(of_method[0], cluster_means=means, histograms=shares)
+        parts = [row.counts for row in of_method]
+        names_of_parts = dict.fromkeys(name for part in parts for name in part)
+        whole = [np.array([*each.clusters.values()]) for each in results]
+        counts = stack(
+            [{n: part.get(n, all_) for n in names_of_parts} for part, all_ in zip(parts, whole, strict=True)]
+        )
+        counts = {name: np.nan_to_num(each) for name, each in counts.items()}
+        means, shares = (
+            {name: pooled(values, counts.get(name, windows)) for name, values in each.items()}
+            for each in (by_cutoff[method], histograms)
+        )
+        totals = {name: each.sum(0).astype(int) for name, each in counts.items()}
+        rows[method] = replace(of_method[0], cluster_means=means, histograms=shares, counts=totals)
     fingerprint = hashlib.sha256("".join(each.data["fingerprint"] for each in results).encode()).hexdigest()
     note = f"{len(results)} cutoffs, fitted {fitted}; first steps of the forecasts: {', '.join(evaluations)}"
     pooled_evaluation = replace(

@@ -23,10 +23,10 @@ from torch import Tensor
 from torch.distributions import kl_divergence
 
 from ...capture import Captured, replayed
-from ...data.batch import Batch
+from ...data.batch import WHOLE, Batch
 from ...factorization.graph import analytic_kl
 from ...locking import serialized
-from ...networks.loop import memoizing
+from ...networks.loop import memoizing, valid_steps
 from ...program.batch import AnyBatch, repeat
 from ...program.conditional import like
 from ...program.groups import Groups
@@ -324,8 +324,10 @@ def _valid_steps(rollout: Rollout) -> Tensor:
         steps = rollout.lengths[:rows].to(reference.dtype)
     if rollout.given is None:
         return steps
-    is_given = rollout.values[rollout.given][:rows].chunk(2, -1)[1].all(-1)
-    return (steps - is_given.sum(-1)).clamp(min=1.0)
+    has_target = rollout.observed[WHOLE][:rows].any(-1)
+    if rollout.lengths is not None:
+        has_target = has_target & valid_steps(rollout.lengths[:rows], rollout.length)
+    return has_target.sum(-1).to(steps).clamp(min=1.0)
 
 
 def _mean(draws: list[Terms]) -> Terms:

@@ -136,7 +136,7 @@ def compare(
     mixtures = {name: value for name, value in models.items() if isinstance(value, Ensemble)}
     labels: dict[str, str] = {}
     for label, model in labelled.items():
-        labels.setdefault(model.view.measured or "the data", label)
+        labels.setdefault(model.view.quantity or "the data", label)
     if len(labels) > 1:
         raise ValueError(
             "bounds are comparable only as densities of the same data, but these are "
@@ -201,7 +201,7 @@ def compare(
         emission=emission,
         seed=seed,
         shown={measure.name: measure.unit for measure in measures if measure.headline},
-        better={measure.name: measure.better for measure in measures if measure.headline},
+        better={measure.name: measure.better for measure in measures},
         notes=["no forecasts: whole sequences have no future"]
         if is_whole
         else list(dict.fromkeys(measure.note for measure in measures if measure.headline and measure.note)),

@@ -117,7 +117,7 @@ class Comparison(Result):
         seed: seed of every model's draws.
         shown: unit of each free-running score in the table.
         notes: lines below that table: how to read scores, or why they are missing.
-        better: "lower", "higher" or "" for each score of that table.
+        better: "lower", "higher" or "" for each score of forecasts.
         filter_particles: K of the FIVO bound; 0 if it was not computed.
         leave_future_out: (L, M), numbers of observed and of forecast steps of "LFO"; empty if it was not computed.
         n_forecast: number of forecast steps of all origins in every sequence, (N,).
@@ -200,7 +200,7 @@ class Comparison(Result):
             KeyError: when a model has no such metric.
             ValueError: when a model has one seed, so that no error over seeds exists, or there is one cluster.
         """
-        better = self.better.get(metric, "lower") if metric in self.shown else "higher"
+        better = "higher" if metric in next(iter(self.rows.values())).bounds else self.better.get(metric, "lower")
         return confidence_set(self._all(metric), better, level, over_seeds=over_seeds)
 
     def required(self, first: str, second: str, metric: str = "IWAE bound", **options: Any) -> Requirement:
@@ -475,7 +475,8 @@ class Comparison(Result):
             raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, names)}; it has {', '.join(names)}")
         places = cluster_index(self.keys).numpy()
         if metric in row.free_running:
-            return TwoWayErrors.of(row.free_running[metric], np.bincount(places, weights=self.n_steps))
+            valid = ~np.isnan(row.free_running[metric]).any(0)  # some clusters lack a partial score
+            return TwoWayErrors.of(row.free_running[metric][:, valid], np.bincount(places)[valid].astype(float))
         weights = self.n_forecast if metric == "LFO" and self.n_forecast is not None else self.n_steps
         return TwoWayErrors.by_cluster(row.bounds[metric], weights, places)
 

@@ -139,26 +139,24 @@ def evaluate(
                 yield slice(start, start + batch_size)
 
         for name, (count, forecaster) in baselines.items():
-            cluster_scores, histograms = evaluator.forecasts(name, forecaster, count, parts(name))
-            rows[name] = Row(count, cluster_scores, histograms=histograms)
+            rows[name] = Row(count, **evaluator.forecasts(name, forecaster, count, parts(name)))
         for name, (count, forecaster) in external.items():
-            cluster_scores, histograms = evaluator.forecasts(name, forecaster, count, parts(name))
             config = {**(configs or {}).get(name, {}), **given[name].record()}
-            rows[name] = Row(count, cluster_scores, config=config, histograms=histograms)
+            rows[name] = Row(count, **evaluator.forecasts(name, forecaster, count, parts(name)), config=config)
         for name, each in models.items():
             with seeded_evaluation(each, seed):
                 forecast_options = {"draw_emission": is_drawn[name], **(options or {})}
                 graphs = _graphs_of(name, each) if cuda_graph else None
                 forecaster = forecaster_of(each, eval_windows, samples, forecast_options, graphs)
-                cluster_scores, histograms = evaluator.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
+                results = evaluator.forecasts(name, forecaster, samples, parts(f"{name}, forecasts"))
             if each.likelihood:
                 with seeded_evaluation(each, seed):
-                    cluster_scores |= evaluator.bounds(name, each, parts(f"{name}, bound"), graphs)
+                    results["cluster_means"] |= evaluator.bounds(name, each, parts(f"{name}, bound"), graphs)
             if each.likelihood or has_ode(each):
                 with seeded_evaluation(each, seed):
-                    cluster_scores |= evaluator.log_score(name, each, parts(f"{name}, log score"), graphs)
+                    results["cluster_means"] |= evaluator.log_score(name, each, parts(f"{name}, log score"), graphs)
             equations = {"generative": each.generative.text, "inference": each.inference.text}
-            rows[name] = Row(samples, cluster_scores, equations, dict((configs or {}).get(name, {})), histograms)
+            rows[name] = Row(samples, **results, equations=equations, config=dict((configs or {}).get(name, {})))
 
     kinds = {"drawn" if each else "mean" for each in is_drawn.values()}
     if not kinds:
@@ -200,9 +198,9 @@ def evaluate(
                 if samples > 1 and _is_deterministic(each, is_drawn[name])
             ),
             *(
-                f"bounds of {name}: densities of {each.view.measured}"
+                f"bounds of {name}: densities of {each.view.quantity}"
                 for name, each in models.items()
-                if isinstance(each, DynamicalVAE) and each.likelihood and each.view.measured
+                if isinstance(each, DynamicalVAE) and each.likelihood and each.view.quantity
             ),
             *(n for name, each in models.items() if isinstance(each, DynamicalVAE) for n in bound_notes(name, each)),
         ],
@@ -273,8 +271,8 @@ class _Evaluator:
     @torch.no_grad()
     def forecasts(
         self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
-    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return free-running scores (C,) and histograms (C, bins) by name, for each of C clusters.
+    ) -> dict[str, Any]:
+        """Return the `cluster_means`, `histograms` and `counts` of a `Row`.
 
         Args:
             name: name of the method, for errors.
@@ -290,13 +288,14 @@ class _Evaluator:
             arguments = forecasts, eval_windows.futures[part], eval_windows.past(part), index[part]
             results.append({measure.name: measure.function(*arguments) for measure in measures})
         values = _concatenate(results)
-        pooled = {
-            measure.name: np.array(measure.pool(values[measure.name], eval_windows.places)) for measure in measures
-        }
-        scores, histograms = (
-            {m.name: pooled[m.name] for m in measures if bool(m.bins) == is_histogram} for is_histogram in (False, True)
-        )
-        return scores, histograms
+        results_by_kind: dict[str, dict[str, np.ndarray]] = {"cluster_means": {}, "histograms": {}, "counts": {}}
+        for measure in measures:
+            kind, of_windows = "histograms" if measure.bins else "cluster_means", values[measure.name]
+            results_by_kind[kind][measure.name] = np.array(measure.pool(of_windows, eval_windows.places))
+            if measure.partial and (missing := of_windows.isnan().reshape(len(index), -1).any(1)).any():
+                counts = np.bincount(eval_windows.places, weights=~missing)
+                results_by_kind["counts"][measure.name] = counts.astype(int)
+        return results_by_kind
 
     def bounds(self, name: str, model: Any, parts: Iterator[slice], graphs: Captured | None) -> dict[str, np.ndarray]:
         """Return bounds, KL terms and k-hat by name, in nats per step, for each cluster."""

@@ -67,7 +67,8 @@ class Score:
 class Row:
     """Scores of one method by cluster (see `Measure.pool`), its number of samples, equations and configuration.
 
-    Histograms, such as the PIT's, have one share per bin for each cluster.
+    Histograms, such as the PIT's, have one share per bin for each cluster. `counts` has the number of windows with a
+    score, for scores that some windows lack.
     """
 
     samples: int
@@ -75,6 +76,9 @@ class Row:
     equations: dict[str, str] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
     histograms: Annotated[dict[str, np.ndarray], Dims("cluster", "bin", name="histogram of {}")] = field(
+        default_factory=dict
+    )
+    counts: Annotated[dict[str, np.ndarray], Dims("cluster", name="windows with {}", kind=int)] = field(
         default_factory=dict
     )
 
@@ -448,8 +452,8 @@ class Evaluation(Result):
     def _draw(self, panel: Axes, method: str, histogram: str) -> None:
         """Draw a histogram relative to uniform, with two standard errors of each bin."""
         cluster_shares = self.rows[method].histograms[histogram].T
-        bins = len(cluster_shares)
-        shares, deviations = linearised(cluster_shares, np.array(list(self.clusters.values())))
+        bins, valid = len(cluster_shares), ~np.isnan(cluster_shares[0])
+        shares, deviations = linearised(cluster_shares[:, valid], np.array(list(self.clusters.values()))[valid])
         errors = np.array([math.sqrt(clustered_variance(each)) for each in deviations])
         edges = np.linspace(0, 1, bins + 1)
         low, high = (bins * (shares + reach * errors) for reach in (-2, 2))
@@ -490,7 +494,9 @@ class Evaluation(Result):
         return self.rows[method]
 
     def _score(self, metric: str, cluster_means: np.ndarray) -> Score:
-        valid = ~np.isnan(cluster_means) if self.metrics[metric].partial else slice(None)
+        valid = ~np.isnan(cluster_means) if self.metrics[metric].partial else np.ones(len(cluster_means), bool)
+        if not valid.any():
+            return Score(math.nan, math.nan, 0)
         mean, deviations = linearised(cluster_means[valid], np.array(list(self.clusters.values()))[valid])
         return Score(float(mean), math.sqrt(clustered_variance(deviations)), len(deviations) - 1)
 

@@ -299,6 +299,7 @@ def variogram_score(samples: Array, truth: Array, order: float = 0.5) -> Tensor:
             if count > 1:  # `Tensor.var` takes nine times as long as everything else
                 errors -= forecast.sub_(mean.unsqueeze(2)).square_().sum(2) / (count * (count - 1))
             total = total + (torch.where(actual.isnan(), 0.0, errors) if missing else errors).sum((0, 2))
+        total = total.masked_fill((n_observed == 0).all(-1), math.nan)
         scores.append(total / ((n_observed * (n_observed - 1)).sum(-1) // 2).clamp(min=1))
     return torch.cat(scores).reshape(lead)
 
@@ -431,7 +432,7 @@ def _ranks_outside(samples: Tensor, level: float) -> float:
 def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
     """Wrap a score of distances so that it ignores missing values of a truth (T, D).
 
-    It uses steps with observations, and sets missing numbers of samples and truth to 0.
+    It uses steps with observations, and sets missing numbers of samples and truth to 0. Without any it is NaN.
     """
 
     def observed_score(samples: Tensor, truth: Tensor) -> Tensor:
@@ -439,6 +440,8 @@ def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor
         if missing.any():
             frames = ~missing.all(-1)
             samples, truth = (torch.where(missing, 0.0, values)[..., frames, :] for values in (samples, truth))
+            if not frames.any():
+                return score(samples, truth) * math.nan
         return score(samples, truth)
 
     return observed_score

@@ -66,20 +66,30 @@ def cluster_means(values: Tensor, clusters: Tensor) -> Sequence[Any]:
 
 
 def means_of_those_that_count(values: Tensor, clusters: Tensor) -> Sequence[Any]:
-    """Return cluster values of a score that is NaN for some windows; their mean is the mean over the other windows.
+    """Return `pseudo_values` of a score that is NaN for some windows, whose mean is that over the other windows."""
+    places, valid = clusters.numpy(), ~values.isnan().numpy()
+    sums = _sums(values.nan_to_num().double().numpy(), places)
+    means: list[Any] = pseudo_values(sums, _sums(valid, places), np.bincount(places)).tolist()
+    return means
+
+
+def pseudo_values(sums: np.ndarray, counts: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    """Return values (C, ...) of clusters whose mean, weighted by their windows, is the mean of those that count.
 
     The value of a cluster is R + N / M (s_c - R m_c) / n_c. Here m_c of its n_c windows have a score, with the sum s_c.
-    M is the number of such windows among all N, and R the mean over these M. This is a linearised ratio of sums, which
-    gives the errors of a ratio (Cochran 1977). All clusters are NaN if no window has a score.
+    M and N are the sums of m_c and n_c over the clusters with such windows, and R is the mean over these M windows.
+    This is a linearised ratio of sums, which gives the errors of a ratio (Cochran 1977). Other clusters are NaN.
+
+    Args:
+        sums: sums s_c of scores (C, ...).
+        counts: numbers m_c of windows with a score (C, ...).
+        windows: numbers n_c of windows (C,).
     """
-    places, valid = clusters.numpy(), ~values.isnan().numpy()
-    if not valid.any():
-        return cluster_means(values, clusters)
-    windows, counts = np.bincount(places), _sums(valid, places)
-    sums = _sums(values.nan_to_num().double().numpy(), places)
-    ratio = sums.sum(0) / counts.sum(0)
-    means: list[Any] = (ratio + ((sums - ratio * counts).T / windows).T * (len(places) / counts.sum(0))).tolist()
-    return means
+    windows = windows.reshape(-1, *[1] * (sums.ndim - 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio, share = sums.sum(0) / counts.sum(0), (windows * (counts > 0)).sum(0) / counts.sum(0)
+        values: np.ndarray = np.where(counts > 0, ratio + share * (sums - ratio * counts) / windows, np.nan)
+    return values
 
 
 def _sums(values: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -100,7 +110,8 @@ class Measure:
         unit, better, partial: see `Metric`.
         pool: function of the scores of all windows, `(N, ...)`, and their clusters; it returns a value for each
             cluster. The mean of these values, weighted by numbers of windows, is the score. The values are
-            pseudo-values for a score of the whole set, and lists of shares for a histogram.
+            pseudo-values for a score of the whole set, and lists of shares for a histogram; a partial score is NaN for
+            clusters that do not count.
         headline: whether the table of a comparison contains it.
         truth: name of a reference row that forecasts the true futures, if the score needs it as a comparison.
         note: line printed below the table.
@@ -336,7 +347,7 @@ def _part(
         return scores.masked_fill(unobserved.reshape(-1, *[1] * (scores.ndim - 1)), torch.nan)
 
     pool = means_of_those_that_count if measure.pool is cluster_means else measure.pool
-    return replace(measure, function=part_score, pool=pool)
+    return replace(measure, function=part_score, pool=pool, partial=True)
 
 
 def over_horizon(windows: HeldOutWindows, steps: Sequence[int] | None = None) -> list[Measure]:

@@ -9,6 +9,7 @@ from torch.distributions import MultivariateNormal
 
 import dvae
 from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
+from dvae.distributions.diffusion import embed_level
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
 from dvae.networks.denoising import BASES
@@ -76,6 +77,15 @@ def test_draws_follow_the_distribution(spec):
     torch.testing.assert_close(draws.mean(0), LOCATION, rtol=0, atol=0.04)
     torch.testing.assert_close(draws.mT.cov(), COVARIANCE, rtol=0, atol=0.06)
     torch.testing.assert_close(module.mean(parameters(1))[0].detach(), LOCATION, rtol=0, atol=0.02)
+
+
+def test_pure_noise_is_no_data_in_single_precision():
+    """float32(pi / 2) is above pi / 2, so its tangent is negative."""
+    module, _ = build(FlowMatching())
+    angle = module.angle(torch.ones(1, 1))
+    assert angle.tan() < 0
+    torch.testing.assert_close(embed_level(angle), embed_level(angle.double()).float())
+    assert embed_level(module.angle(torch.zeros(1, 1)))[0, 0] < 0 < embed_level(angle)[0, 0]
 
 
 def test_the_second_order_sampler_converges_faster_than_ddim():

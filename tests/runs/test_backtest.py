@@ -8,11 +8,14 @@ from dataclasses import replace
 import matplotlib
 import numpy as np
 import pytest
+import torch
 
 import dvae
 from dvae.cli import main
 from dvae.inference.evaluation.estimates import clustered_variance, linearised
-from dvae.runs.backtest import Backtest, backtest
+from dvae.inference.evaluation.evaluation import Evaluation, Row
+from dvae.inference.evaluation.scores import Metric, means_of_those_that_count
+from dvae.runs.backtest import Backtest, backtest, pool
 from dvae.runs.sweep import SweepInterrupted
 from dvae.tables import Cut, PanelData
 
@@ -70,6 +73,23 @@ def test_scores_are_pooled_over_cutoffs_and_clustered_by_sequence(result):
     assert result.plot_calibration()._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(KeyError, match="no cutoff '2020-02-13'; there are 2020-02-12"):
         result.at("2020-02-13")
+
+
+def test_a_score_that_some_windows_lack_is_the_mean_of_the_others():
+    known = np.array([[[1, 1], [1, 0]], [[0, 1], [0, 0]], [[1, 1], [1, 1]]], bool)  # cutoffs, sequences, windows
+    values = np.random.default_rng(0).normal(size=known.shape)
+    clusters, evaluations = torch.tensor([0, 0, 1, 1]), {}
+    for number, (scores, present) in enumerate(zip(values, known, strict=True)):
+        of_windows = torch.tensor(np.where(present, scores, np.nan)).flatten()
+        means = np.array(means_of_those_that_count(of_windows, clusters))
+        row = Row(5, {"CRPS": means}, counts={"CRPS": present.sum(1)})
+        metrics, extents = {"CRPS": Metric(partial=True)}, {"test/a": 2, "test/b": 2}
+        options = {"data": {"fingerprint": "f"}, "protocol": {}, "samples": 5, "emission": "drawn"}
+        evaluations[str(number)] = Evaluation({"m": row}, metrics, extents, bound_particles=0, seed=0, **options)
+    score = pool(evaluations, "at every cutoff")["m"]["CRPS"]
+    assert score.mean == pytest.approx(values[known].mean())
+    deviations = ((values - score.mean) * known).sum((0, 2)) / known.sum()
+    assert score.standard_error == pytest.approx(np.sqrt(clustered_variance(deviations)))
 
 
 def test_each_cutoff_equals_an_evaluation_of_its_own_fit(result, data):

@@ -194,7 +194,7 @@ def _multimodal(
         "basis": {"multimodal": settings},
     }
 
-    pool: Any = {} if itself else {"pool": means_of_those_that_count}
+    pool: Any = {} if itself else {"pool": means_of_those_that_count, "partial": True}
 
     @lru_cache(maxsize=1)  # shared by all scores of a batch
     def errors(forecasts: Tensor, index: Tensor) -> Tensor:
@@ -218,7 +218,7 @@ def _multimodal(
         for place, name in enumerate(_MULTIMODAL)
         if itself or alone < len(truths)
     ]
-    apde = Measure("APDE", diversity_error, pool=means_of_those_that_count, **shared)
+    apde = Measure("APDE", diversity_error, pool=means_of_those_that_count, partial=True, **shared)
     return [*truths_of_window, *([apde] if alone < len(truths) else [])]
 
 

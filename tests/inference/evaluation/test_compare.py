@@ -12,9 +12,11 @@ import dvae
 from dvae import Comparison, DynamicalVAE, Oracle, linear_gaussian_surrogate, motion
 from dvae.cli import main
 from dvae.data.sequences import ArrayWindows
+from dvae.data.views import Past
 from dvae.inference.evaluation.compare import compare
 from dvae.inference.evaluation.comparison import ModelResult
 from dvae.inference.evaluation.evaluate import evaluate
+from dvae.inference.evaluation.scores import Measure
 
 T = 5
 DKF = ("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | z_{t-1}, x_{t:T})")
@@ -385,3 +387,17 @@ def test_the_best_of_many_models_depends_on_the_direction_of_the_metric():
     assert result.required("b", "a").achieved > 0.9
     with pytest.raises(KeyError, match="no score 'ADE'"):
         result.confidence_set("ADE")
+    windows = ArrayWindows(torch.randn(20, T, 2), 3)
+    models = {name: [build(seed=seed, scale=scale) for seed in (0, 1)] for name, scale in (("a", 1.0), ("b", 0.1))}
+    square = Measure("square", lambda f, t, p, index: f.square().mean((1, 2, 3)), better="lower", headline=False)
+    result = run(models, windows, samples=3, scores=lambda _: [square])
+    assert result.shown == {}  # the score is in no table
+    least = min("ab", key=lambda name: result[name]["square"].mean)
+    assert result.confidence_set("square", over_seeds=False).members == [least]
+
+
+def test_densities_given_a_past_are_not_compared_with_densities_of_all_steps():
+    past = DynamicalVAE("p(x_t | s)", "", {"x": 2, "s": 8}, view=Past("s", 4))
+    models = {"past": past, "all": DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})}
+    with pytest.raises(ValueError, match="steps after the first 4 given the first 4 for past, of the data for all"):
+        run(models, ArrayWindows(torch.randn(8, 6, 2), 4))

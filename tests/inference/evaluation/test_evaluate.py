@@ -1,5 +1,6 @@
 """Evaluation: all rows on the same windows, correct standard errors, complete records."""
 
+import dataclasses
 import json
 import math
 from dataclasses import replace
@@ -317,11 +318,32 @@ def test_a_score_of_the_whole_set_may_skip_clips():
     assert scores["some"].freedom == 1
 
 
-def test_windows_with_nan_scores_leave_the_mean_but_not_their_clip():
+def test_windows_with_nan_scores_leave_the_mean():
     values = torch.tensor([1.0, torch.nan, 3.0, torch.nan, torch.nan, 8.0])
     clips = torch.tensor([0, 0, 1, 2, 2, 3])
     of_clips = torch.tensor(means_of_those_that_count(values, clips))
-    assert float(of_clips @ (clips.bincount() / 6.0)) == pytest.approx(4.0)  # (1 + 3 + 8) / 3
-    assert of_clips[2] == pytest.approx(4.0)  # NaN values change nothing
+    assert of_clips[2].isnan()  # it has no window with a score
+    assert float(of_clips[[0, 1, 3]] @ (clips.bincount()[[0, 1, 3]] / 4.0)) == pytest.approx(4.0)  # (1 + 3 + 8) / 3
+
+
+@pytest.mark.parametrize(("known", "freedom"), [(1, 0), (2, 1), (4, 3)])
+def test_clips_without_a_score_do_not_reduce_its_error(known, freedom):
+    windows = ArrayWindows(torch.randn(8, 3, 1), 2, groups=list("aabbccdd"))
+    score = Measure("place", lambda f, t, p, index: torch.where(index < 2 * known, 1.0 * index, torch.nan))
+    measure = replace(score, pool=means_of_those_that_count, partial=True)
+    _, scores = still(windows, measure)
+    means = np.arange(known) * 2 + 0.5
+    error = means.std(ddof=1) / known**0.5 if known > 1 else np.nan
+    np.testing.assert_allclose(dataclasses.astuple(scores["place"]), (means.mean(), error, freedom))
+
+
+def test_a_measure_that_no_window_has_is_unknown():
+    windows = ArrayWindows(torch.randn(4, 3, 1), 2)
+    _, scores = still(windows, Measure("none", lambda f, t, p, index: torch.nan * index, partial=True))
+    assert np.isnan(scores["none"].mean)
+
+
+def test_a_score_that_all_windows_have_is_their_mean():
+    clips = torch.tensor([0, 0, 1, 2, 2, 3])
     score_values = torch.arange(6.0)
     assert means_of_those_that_count(score_values, clips) == pytest.approx(list(cluster_means(score_values, clips)))

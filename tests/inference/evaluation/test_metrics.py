@@ -1,5 +1,7 @@
 """Scores of forecasts: their definitions, written out with loops, and the distributions they obey."""
 
+import math
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -158,3 +160,9 @@ def test_cmd_is_the_area_between_cumulative_motion_curves():
     torch.testing.assert_close(early, 6 * late)
     with pytest.raises(ValueError, match="T at least 2"):
         cumulative_motion_distance(motion, motion[0])
+
+
+def test_a_future_without_values_has_no_score():
+    samples, truth = draw(3, 4, 2, seed=0), torch.full((4, 2), math.nan)
+    for score in (continuous_ranked_probability_score, energy_score, variogram_score):
+        assert score(samples, truth).isnan(), score.__name__
