@@ -192,15 +192,17 @@ def backtest(
                 names = [run.path.name.removesuffix(suffix) for run in loaded]
                 models = {name: run.model for name, run in zip(names, loaded, strict=True)}
                 configs = {name: run.method.config() for name, run in zip(names, loaded, strict=True)}
-            own = replace(before, schema=replace(known.schema, cut=before.protocol))
+            windows = replace(before, schema=replace(known.schema, cut=before.protocol)).following(step)
             evaluations[name] = evaluate(
                 models,
-                own.following(step),
+                windows,
                 training_windows=before.windows("train+validation"),
                 configs=configs,
                 progress=progress,
                 **options,
             )
+            if windows.skipped:
+                evaluations[name].notes.append(f"cutoff {name} leaves out {windows.too_short}")
     return pool(evaluations, "at every cutoff" if refit else "at the first cutoff")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from .calendar import EVEN, FEATURES, FLAG, Calendar, functions_of_time
 from .columns import ROUNDED, Column
 from .numerals import resolution
 from .panel import Panel, Series
-from .protocol import Cut
+from .protocol import Cut, begin_of
 
 SPIKE, REPEATS = 0.05, 20
 """Share and number of equal values that are a spike; REPEATS is also the minimum number of compared rows."""
@@ -32,6 +33,8 @@ CONTRAST = 10.0
 """Ratio of scales or levels of sequences above which they differ."""
 LONG = 8
 """Minimum number of values that determine the scale of a sequence."""
+SERIAL = (20_000, 80_000)
+"""Range of days since 1899-12-30, the first date of spreadsheets, that are read as dates."""
 NEAR = 7
 """Largest lag of copies in which no number is unique."""
 ROWS, COMPARED, COLUMNS = 200_000, 5000, 30
@@ -57,6 +60,8 @@ def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
     compared = columns[:COLUMNS], values[:COMPARED, :COLUMNS], owners[:COMPARED]
     return [
         *_spikes(columns, values),
+        *_marks(columns, values),
+        *_serial(panel, times),
         *_split(panel, cut, guessed),
         *_season(panel, cut),
         *(() if panel.columns.lags else _absent(times, panel.calendar)),  # with lags, the schema warns
@@ -83,6 +88,8 @@ def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
         levels, counts = np.unique(cells[~np.isnan(cells)], return_counts=True)
         if column.role != "target" or column.family not in ROUNDED or column.rounding or not len(levels):
             continue
+        if len(levels) > 2 and _is_mark(levels, int(counts.argmax())):
+            continue
         share, level, unit = counts.max() / counts.sum(), levels[counts.argmax()], resolution(levels)
         remedies = [f"rounding = {unit:g}"] if unit else []
         remedies += ["the family sparse-overdispersed"] if unit == 1 and levels[0] == level == 0 else []
@@ -100,6 +107,37 @@ def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
         )
 
 
+def _marks(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
+    """Yield repeated values that may mark missing values."""
+    for column, cells in zip(columns, values.T, strict=True):
+        levels, counts = np.unique(cells[~np.isnan(cells)], return_counts=True)
+        for place in {0, len(levels) - 1} if len(levels) > 2 and column.family != "category" else ():
+            if counts[place] > 1 and _is_mark(levels, place):
+                mark = f"{levels[place]:g}"
+                yield (
+                    f"{counts[place]} values of {column.name!r} are {mark}, far from all others; if it marks missing "
+                    f'values, set na_values = ["{mark}"] (--na-values {mark})'
+                )
+
+
+def _is_mark(levels: np.ndarray, place: int) -> bool:
+    """Return whether a level is a number of nines, such as -999, and far from all others."""
+    digits, others = f"{abs(levels[place]):.0f}", np.delete(levels, place)
+    return len(digits) > 1 and {*digits} == {"9"} and bool(abs(levels[place]) > 2 * abs(others).max())
+
+
+def _serial(panel: Panel, times: Sequence[np.ndarray]) -> Iterator[str]:
+    """Yield a sentence for times that may be the days of a spreadsheet."""
+    name = str(panel.columns.time)
+    if times and panel.calendar.kind == "numbers" and re.search("date|day|datum", name.lower()):
+        joined = np.concatenate(times)
+        if (joined % 1 == 0).all() and SERIAL[0] <= joined.min() and joined.max() <= SERIAL[1]:
+            yield (
+                f"the times {name!r}, such as {joined[0]:g}, are numbers; if they are days of a spreadsheet, convert "
+                "them by pandas.to_datetime(column, unit='D', origin='1899-12-30')"
+            )
+
+
 def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:
     reason = "a split by sequence would reveal events of the test dates, since the sequences share their dates"
     if is_aligned(panel) and not any(sequence.split for sequence in panel):
@@ -107,6 +145,30 @@ def _split(panel: Panel, cut: Cut, guessed: bool) -> Iterator[str]:
             yield f'{reason}; set split = "time" in [cut], with observed and horizon (--split time)'
         elif cut.split == "time" and guessed:
             yield f'the proposed split is by time: {reason}; split = "sequence" tests new sequences instead'
+        if cut.split == "time" and not cut.test_steps:
+            yield from _shared_dates(panel, cut)
+
+
+def _shared_dates(panel: Panel, cut: Cut) -> Iterator[str]:
+    """Yield a sentence if dates of test futures of some sequences are dates of the training part of others."""
+    steps = max(round(cut.test * max(map(len, panel.series))), 1)
+    if begin_of(panel, steps) is None:
+        return
+
+    def ends(split: str, skipped: int, last: bool) -> list[tuple[float, str]]:
+        """Return the time of the first or last step of each sequence in a split, after skipped steps."""
+        spans = [(panel.series[index], low + skipped, high) for index, low, high in cut.spans(panel, split)]
+        places = [(sequence, high - 1 if last else low) for sequence, low, high in spans if low < high]
+        return [(float(one.times[place]), one.name) for one, place in places if one.times is not None]
+
+    begin, early = min(ends("test", cut.observed or 0, last=False), default=(np.inf, ""))
+    end, late = max(ends("train", 0, last=True), default=(-np.inf, ""))
+    if begin <= end:
+        yield (
+            f"each sequence is divided at its own date: the test steps of {early!r} begin on "
+            f"{panel.calendar.text(begin)}, and the training steps of {late!r} end on {panel.calendar.text(end)}; "
+            f"test = {steps} (--test {steps}) divides all at one date"
+        )
 
 
 def _season(panel: Panel, cut: Cut) -> Iterator[str]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .numerals import read_numbers
-from .parsing import MONTHS, compact, dates, is_number
+from .parsing import MONTHS, compact, dates, is_dotted, is_number
 
 CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:\.\d{1,9})?))?\s?(?:([ap])\.?m\.?)?", re.IGNORECASE | re.ASCII)
 PERIOD = re.compile(
@@ -78,6 +78,8 @@ def time_of(frame: Any, time: str | tuple[str, ...], decimal: str | None = None)
     if isinstance(time, tuple):
         return join_times(frame, time)
     column = frame[time]
+    if is_dotted(column):
+        return column
     numbers = read_numbers(column, (), decimal, column.attrs.get("decimal"))
     if is_number(column) or not numbers.is_numeric:
         return column

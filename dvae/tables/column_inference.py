@@ -27,6 +27,7 @@ from .parsing import (
     dates,
     describe_marks,
     index_levels,
+    is_dotted,
     is_duration,
     is_number,
     tabular,
@@ -43,7 +44,7 @@ LARGE_COUNT = 1000
 LARGEST = 1e30
 """Bound on absolute values, since models compute in float32."""
 TIMES = re.compile(
-    r"(^|_)(time|date|datetime|timestamp|day|week|month|quarter|year|hour|minute|second|step|frame|t|ds)(_|$)"
+    r"(^|_)(time|date|datetime|timestamp|datum|day|week|month|quarter|year|hour|minute|second|step|frame|t|ds)(_|$)"
 )
 IDS = re.compile(r"(^|_)(id|unique_id|series|sequence|subject|station|store|item|patient|name|key)(_|$)")
 ROWS = re.compile(r"no\.?|nr\.?|num|number|row|row_?(id|no|nr|num|number)|index|idx|obs|#", re.IGNORECASE)
@@ -452,11 +453,13 @@ class _Inference:
         return False
 
     def _is_compact(self, name: str) -> bool:
-        """Return whether numbers with the name of a time are dates such as 20241231."""
+        """Return whether numbers with the name of a time are dates such as 20241231, or months such as 2024.12."""
         values = self.plain[name]
+        if TIMES.search(name.lower()) and is_dotted(self.frame[name]):
+            return True
         if not TIMES.search(name.lower()) or not _is_whole(values) or values.isna().any():
             return False
-        return compact(values.to_numpy(np.float64)) is not None
+        return compact(values.to_numpy(np.float64), name) is not None
 
     def _numbers_rows(self, name: str) -> bool:
         """Return whether a column numbers the rows, such as an unnamed index that pandas wrote to a CSV."""

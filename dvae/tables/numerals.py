@@ -26,6 +26,7 @@ _TEXTS = {
     )
     for decimal, group in _GROUP.items()
 }
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}\.\d{3}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,10 @@ def read_numbers(
     if column.dtype.kind in "mMc" or isinstance(column.dtype, pd.PeriodDtype | pd.IntervalDtype):
         return Numbers(nothing, column.notna().to_numpy(), {})
     if decimal == "." or (decimal is None and hint in (None, ".")):
-        plain = _plain(column.to_numpy(object, na_value=np.nan))
+        cells = column.to_numpy(object, na_value=np.nan)
+        plain = _plain(cells)
+        if hint is None and decimal is None and plain is not None and _are_thousands(cells, plain):
+            hint = ""
         if plain is not None and (decimal or hint is None or not _has_large_whole(plain)):
             plain[np.isin(plain, sentinels)] = np.nan
             return Numbers(plain, np.zeros(len(column), bool), {})
@@ -163,6 +167,15 @@ def _numbers(cells: list[Any], decimal: str | None, hint: str | None) -> tuple[n
 def _has_large_whole(values: np.ndarray) -> bool:
     """Return whether some number is an integer of three digits or more; 1.000 next to it means 1000."""
     return bool(((np.abs(values) >= 100) & (values == np.trunc(values))).any())
+
+
+def _are_thousands(cells: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether texts with a dot may be thousands: all have three decimals, beside integers from 100 to 999."""
+    whole = values == np.trunc(values)
+    fractions, integers = values[~whole & ~np.isnan(values)], np.abs(values[whole])
+    if not len(fractions) or not ((integers >= 100) & (integers < 1000)).any():
+        return False
+    return bool((integers < 1000).all()) and all(_THOUSANDS.fullmatch(str(cell)) for cell in cells if "." in str(cell))
 
 
 def _parse(cells: list[Any], decimal: str) -> np.ndarray:

@@ -15,6 +15,7 @@ blocks and windows.
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -32,7 +33,7 @@ from .clocks import time_of
 from .column_inference import LARGEST, TIMES, ColumnHints, is_date
 from .columns import Column, Columns
 from .numerals import is_multiple, read_numbers, resolution
-from .parsing import is_duration, is_number, numeric, tabular, texts, times
+from .parsing import is_duration, is_number, n_offsets, numeric, tabular, texts, times
 
 SPLITS = ("train", "validation", "test")
 COUNTS = ("count", "overdispersed", "sparse", "sparse-overdispersed")
@@ -443,6 +444,12 @@ def _split_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
     if columns.time is not None:
         moments = time_of(frame, columns.time, columns.decimal)
         row_times, calendar = times(moments, columns.zone, rows)
+        if columns.calendar and columns.zone is None and calendar.zone == "UTC" and n_offsets(moments) > 1:
+            warnings.warn(
+                f"the dates of column {moments.name!r} have several offsets from UTC, so {', '.join(columns.calendar)} "
+                'are those of UTC; name the time zone, such as zone = "Europe/Berlin"',
+                stacklevel=3,
+            )
     for name, indices in zip(names, rows, strict=True):
         if row_times is not None:
             indices = _sort_rows(row_times, indices, f"sequence {name!r}", calendar, moments.name)

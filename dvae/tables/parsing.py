@@ -31,7 +31,8 @@ WRITTEN = [
     for pattern in (
         r"(?P<first>\d{1,2})(?P<sign>[-/. ])\s?(?P<second>\d{1,2})(?P=sign)\s?(?P<year>\d{4}|\d\d)",
         r"(?P<year>\d{4})[-/. ](?P<month>\d{1,2})[-/. ](?P<day>\d{1,2})",
-        r"(?P<month>\d{1,2})[-/](?P<year>\d{4})",
+        r"(?P<month>\d{1,2})[-/.](?P<year>\d{4})",
+        r"(?P<year>\d{4})\.(?P<month>\d\d)",
         r"(?P<year>\d{4})[-/ ]?Q(?P<quarter>[1-4])",
         r"Q(?P<quarter>[1-4])[-/ ]?(?P<year>\d{4})",
         r"(?P<year>\d{4})-?W(?P<week>\d\d)(?:-?(?P<day>[1-7]))?",
@@ -41,6 +42,10 @@ WRITTEN = [
     )
 ]
 """Date formats other than ISO 8601; a column has one of these formats."""
+COMPACT = {14: "%Y%m%d%H%M%S", 12: "%Y%m%d%H%M", 10: "%Y%m%d%H", 8: "%Y%m%d", 6: "%Y%m"}
+"""Formats of dates that are integers, by number of digits."""
+DOTTED = re.compile(r"(?:1[89]|2[01])\d\d\.(?:0[1-9]|1[0-2])|(?:0[1-9]|1[0-2])\.(?:1[89]|2[01])\d\d", re.ASCII)
+"""Months with a dot."""
 _OFFSET = re.compile(r"[T :]\d\d[\d:.]*\s?(z|utc|gmt|[-+]\d[\d:]{1,4})$", re.IGNORECASE | re.ASCII)
 """Offset from UTC at the end of a date."""
 _DURATION = re.compile(r"[-+]?(?:\d{1,6} days?,? ?)?[-+]?\d{1,6}:\d\d:\d\d(?:\.\d{1,9})?|[-+]?\d{1,6} days?", re.ASCII)
@@ -165,16 +170,35 @@ def _offsets(strings: Any) -> Any:
     return strings.astype(str).str.extract(_OFFSET)[0].str.upper().replace({"UTC": "Z", "GMT": "Z"})
 
 
-def compact(numbers: np.ndarray) -> Any:
-    """Parse integers such as 20241231 or 202412 as dates; None if some are not dates."""
+def n_offsets(column: Any) -> int:
+    """Return the number of different offsets from UTC in dates; 0 if they are not texts."""
+    return int(_offsets(column).nunique()) if column.dtype.kind == "O" else 0
+
+
+def compact(numbers: np.ndarray, name: Any = "") -> Any:
+    """Parse integers such as 20241231, 202412 or 2024123123 (with the hour) as dates; None if some are not dates.
+
+    Args:
+        numbers: integers (N,).
+        name: name of the column; six digits are a year and an ISO week if it contains "week", and a month otherwise.
+    """
     import pandas as pd
 
     least, most = (numbers.min(), numbers.max()) if len(numbers) and (numbers % 1 == 0).all() else (0, 0)
-    for digits, pattern in ((8, "%Y%m%d"), (6, "%Y%m")):
+    for digits, pattern in COMPACT.items():
         if least // 10 ** (digits - 4) >= 1800 and most // 10 ** (digits - 4) <= 2200:
-            parsed = pd.to_datetime(pd.Series(numbers.astype(int).astype(str)), format=pattern, errors="coerce")
+            cells = pd.Series(numbers.astype(int).astype(str))
+            if digits == 6 and "week" in str(name).lower():
+                cells, pattern = cells + "1", "%G%V%u"
+            parsed = pd.to_datetime(cells, format=pattern, errors="coerce")
             return None if parsed.isna().any() else parsed
     return None
+
+
+def is_dotted(column: Any) -> bool:
+    """Return whether a column contains texts of months, such as 2024.01 or 01.2024, that could also be numbers."""
+    cells = column.dropna()
+    return column.dtype.kind == "O" and bool(len(cells)) and all(DOTTED.fullmatch(str(cell)) for cell in cells.unique())
 
 
 def is_duration(column: Any) -> bool:
@@ -254,7 +278,7 @@ def times(
     if is_number(column):
         values, calendar = column.to_numpy(np.float64, na_value=np.nan), NUMBERS
         valid = np.isfinite(values)
-        if valid.all() and (parsed := compact(values)) is not None:
+        if valid.all() and (parsed := compact(values, column.name)) is not None:
             return times(parsed.rename(column.name), zone, sequences)
     elif is_duration(column):
         spans = pd.to_timedelta(column if column.dtype.kind == "m" else column.astype(str).where(column.notna()))

@@ -69,6 +69,8 @@ def test_scores_are_pooled_over_cutoffs_and_clustered_by_sequence(result):
         assert result[method]["CRPS"].standard_error == pytest.approx(np.sqrt(clustered_variance(deviations)))
         assert result[method]["CRPS"].freedom == 4
     assert result.difference("auto", "last value", "CRPS").standard_error > 0
+    shorter = [note for note in result.notes if "leaves out 1 sequences with fewer than 9 steps" in note]
+    assert [note.split()[1] for note in shorter] == ["2020-02-18", "2020-02-24"]
     assert result.plot()._repr_png_().startswith(b"\x89PNG")
     assert result.plot_calibration()._repr_png_().startswith(b"\x89PNG")
     with pytest.raises(KeyError, match="no cutoff '2020-02-13'; there are 2020-02-12"):

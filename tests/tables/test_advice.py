@@ -1,5 +1,7 @@
 """Findings about tables: what harms a model is named with its option, and other columns are not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,6 +130,44 @@ def test_absent_rows_are_named():
     weekdays = days[days % 7 < 5]
     for times in (weekdays, days**1.1, days[::10], days[:1]):  # uneven by nature, or even
         assert not found(noise(3, len(times), 1), times=DAY * times)
+
+
+def test_closing_hours_are_named_and_hide_the_usual_season():
+    hours = np.arange(24 * 30)
+    times = 3600.0 * hours[(hours % 24 >= 9) & (hours % 24 < 17)]
+    for observed in (10, 40):
+        (text,) = found(noise(1, len(times), 1), times=times, cut=Cut(observed, 2, split="time"))
+        assert text.startswith("29 steps are longer than the others")
+
+
+def test_numbers_that_mark_missing_values_are_named():
+    values = 20 + 5 * noise(1, 300, 2)
+    values[0, ::50, 0] = -999
+    (text,) = found(values)
+    assert text.startswith("6 values of 'x0' are -999, far from all others; if it marks missing values, set na_values")
+    values[0, ::50, 0] = -9  # a possible temperature
+    assert not found(values)
+
+
+def test_days_of_a_spreadsheet_are_named():
+    series, columns = [Series("a", noise(50, 1), 45_000.0 + np.arange(50))], Columns((Column("y"),), time="Date")
+    (text,) = findings(Panel(series, columns), Cut(3, 1, split="time"), False)
+    assert text.startswith("the times 'Date', such as 45000, are numbers; if they are days of a spreadsheet")
+    series = [replace(series[0], times=np.arange(50.0))]
+    assert not findings(Panel(series, columns), Cut(3, 1, split="time"), False)
+
+
+def test_a_division_at_different_dates_is_named():
+    ends = {"early": 70, "late": 100}
+    series = [Series(name, noise(end, 1), DAY * np.arange(end)) for name, end in ends.items()]
+    panel = Panel(series, Columns((Column("y"),)), "table", Calendar("dates"))
+    cuts = Cut(3, 1, split="time"), Cut(3, 1, split="time", test=20)
+    (text,) = findings(panel, cuts[0], False)
+    assert text.startswith(
+        "each sequence is divided at its own date: the test steps of 'early' begin on 1970-02-26 00:00:00, and the "
+        "training steps of 'late' end on 1970-03-11 00:00:00; test = 20 (--test 20)"
+    )
+    assert not findings(panel, cuts[1], False)
 
 
 def test_columns_that_reveal_a_target_are_named():

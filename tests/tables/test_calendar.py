@@ -49,14 +49,33 @@ def test_times_continue_by_the_calendar(step, zone):
         (pd.date_range("2023-01-01", periods=12, freq="MS") + pd.Timedelta("14D 12h"), "2024-01-15 12:00"),
         (["2023-01-30", "2023-02-28", "2023-04-30", "2023-05-30", "2023-07-30", "2023-08-30"], "2023-09-30"),
         ([*pd.bdate_range("2023-01-02", "2023-01-27").delete([5, 11])], "2023-01-30"),
+        ([day for day in pd.date_range("2023-01-02", "2023-03-04") if day.weekday() != 6], "2023-03-06"),
+        ([day for day in pd.date_range("2023-01-02", "2023-03-03") if day.weekday() in (0, 2, 4)], "2023-03-06"),
         (["2023-01-02", "2023-01-05", "2023-01-07", "2023-01-10", "2023-01-16"], "2023-01-19"),
         (pd.DatetimeIndex(["2024-10-19", "2024-10-22", "2024-10-24", "2024-10-26"], tz="Europe/Berlin"),
             pd.Timestamp("2024-10-28", tz="Europe/Berlin")),
     ],
-    ids=["periods", "15th", "30th with a gap", "holidays", "irregular", "new clocks"],
+    ids=["periods", "15th", "30th with a gap", "holidays", "no Sundays", "three days", "irregular", "new clocks"],
 )  # fmt: skip
 def test_steps_are_inferred_from_any_day_and_with_missing_rows(times, expected):
     assert future(frame_of(times))[0] == pd.Timestamp(expected)
+
+
+def test_a_week_without_some_days_is_a_season():
+    days = pd.date_range("2023-01-02", periods=60)
+    for skipped, step, season in ((6, "MON-TUE-WED-THU-FRI-SAT", 6), (0, "TUE-WED-THU-FRI-SAT-SUN", 6), (7, "1D", 7)):
+        calendar = Panel.of(frame_of(days[days.day_of_week != skipped])).calendar
+        assert (calendar.step, calendar.usual_season, calendar.skips_days) == (step, season, season < 7)
+    with pytest.raises(ValueError, match="step is 'MON-'; expected a calendar step such as"):
+        Calendar("dates", step="MON-")
+
+
+def test_forecasts_over_closing_hours_cause_a_warning():
+    hours = pd.date_range("2023-01-02", periods=24 * 20, freq="h")
+    frame = frame_of(hours[(hours.hour >= 9) & (hours.hour < 17)])
+    with pytest.warns(UserWarning, match="many steps up to 2023-01-21 16:00:00 are longer than the others, as over"):
+        assert future(frame)[0] == pd.Timestamp("2023-01-21 17:00")
+    assert Panel.of(frame).usual_season == 0
 
 
 WORKDAYS = [seconds(pd.bdate_range("2024-01-01", periods=count)) for count in (12, 12, 1)]

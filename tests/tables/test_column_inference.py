@@ -424,6 +424,25 @@ def test_thousands_are_not_read_as_fractions(tmp_path, sign, separator):
         np.testing.assert_array_equal(panel.series[0].values[:, 0], np.arange(700, 2500, 30))
 
 
+def test_thousands_with_a_dot_are_ambiguous_between_commas(tmp_path):
+    days = pd.date_range("2024-01-01", periods=60).strftime("%Y-%m-%d")
+
+    def read_cells(cells, hints=None):
+        lines = [f"{day},{cell}" for day, cell in zip(days, cells, strict=False)]
+        (tmp_path / "a.csv").write_text("\n".join(["day,visitors", *lines]) + "\n")
+        return read_panel(tmp_path / "a.csv", hints).series[0].values[:, 0]
+
+    grouped = [f"{n:,}".replace(",", ".") for n in range(700, 2500, 30)]
+    with pytest.raises(
+        ValueError, match=r"'visitors' holds '1\.000', which may be 1000 or a fraction; give the decimal"
+    ):
+        read_cells(grouped)
+    np.testing.assert_array_equal(read_cells(grouped, ColumnHints(decimal=",")), np.arange(700, 2500, 30))
+    assert read_cells(grouped, ColumnHints(decimal="."))[10] == 1.0
+    for other in ("1.5", "2500", "0.125"):  # no number of thousands
+        assert read_cells([*grouped[1:], other])[9] == 1.0
+
+
 @pytest.mark.parametrize("cell", ["2024-02-30", "2024-13-01", "2024-01-xx", "soon"])
 def test_a_single_cell_that_is_no_date_is_named(cell):
     days = [*pd.date_range("2024-01-01", periods=30).strftime("%Y-%m-%d"), cell]

@@ -234,7 +234,8 @@ def test_dates_of_mixed_lengths_and_before_1970_are_read(column, gaps):
             ("667min", form)
             for form in ("%Y%m%dT%H%M", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %I:%M %p", " %d/%m/%Y %H:%M UTC")
         ),
-        *(("MS", form) for form in ("%Y-%m", "%m/%Y", "number %Y%m")),
+        *(("97h", form) for form in ("number %Y%m%d%H", "number %Y%m%d%H%M", "number %Y%m%d%H%M%S")),
+        *(("MS", form) for form in ("%Y-%m", "%m/%Y", "number %Y%m", "%Y.%m", "%m.%Y")),
         *(("QS", form) for form in ("%YQq", "%Y-Qq")),
         *(("W-MON", form) for form in ("%G-W%V", "%GW%V", "number %Y%m%d")),
     ],
@@ -246,6 +247,24 @@ def test_times_are_read_in_every_notation(freq, notation):
     panel = Panel.of(frame)
     assert panel.columns.time == "t"
     np.testing.assert_array_equal(panel.series[0].times, times.astype("datetime64[s]").astype(int))
+
+
+def test_years_with_weeks_are_read_by_the_name_of_their_column():
+    monday = pd.date_range("2019-12-02", periods=60, freq="W-MON")
+    weeks = [int(each.strftime("%G%V")) for each in monday]
+    panel = Panel.of(pd.DataFrame({"week": weeks, "y": np.arange(60.0)}))
+    np.testing.assert_array_equal(panel.calendar.to_pandas(panel.series[0].times), monday)
+    panel = Panel.of(pd.DataFrame({"t": weeks, "y": np.arange(60.0)}))  # 202053 is no month
+    assert panel.calendar.kind == "numbers"
+
+
+def test_calendar_features_of_dates_with_several_offsets_are_warned_of():
+    times = pd.date_range("2024-10-26", periods=60, freq="h", tz="Europe/Berlin").astype(str)
+    frame, columns = pd.DataFrame({"t": times, "y": np.arange(60.0)}), Columns((Column("y"),), time="t")
+    Panel.of(frame, columns)
+    with pytest.warns(UserWarning, match="'t' have several offsets from UTC, so hour are those of UTC; name the time"):
+        Panel.of(frame, replace(columns, calendar=("hour",)))
+    Panel.of(frame, replace(columns, calendar=("hour",), zone="Europe/Berlin"))
 
 
 @pytest.mark.parametrize(
