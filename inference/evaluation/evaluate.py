@@ -269,9 +269,7 @@ class _Evaluator:
     log_score_particles: int
 
     @torch.no_grad()
-    def forecasts(
-        self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]
-    ) -> dict[str, Any]:
+    def forecasts(self, name: str, forecaster: Forecaster, samples: int, parts: Iterator[slice]) -> dict[str, Any]:
         """Return the `cluster_means`, `histograms` and `counts` of a `Row`.
 
         Args:

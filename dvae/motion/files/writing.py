@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -15,8 +16,11 @@ from typing import Any
 import numpy as np
 
 from ... import files
+from ...data.sequences import tensor_of
 from ...inference.evaluation.result import progress_bar
 from ..data.clips import Clip, MotionSet, extents
+from ..geometry.kinematics import forward
+from ..geometry.rotations import to_matrix
 from ..geometry.skeleton import Skeleton, brief
 from .arrays import LABELS, SKELETON, own_companion, save, save_clips, write_labels, write_table
 from .bvh import write_bvh
@@ -25,6 +29,8 @@ from .recording import Recording
 from .smpl import write_amass
 from .world import infer_world
 
+DEVIATION = 0.01
+"""Largest distance in metres by which rotations may move a joint without a warning."""
 FORMATS = {"npz": ".npz", "bvh": ".bvh", "csv": ".csv", "amass": ".npz"}
 """Formats and their file name endings. Only `npz` stores many clips in one file."""
 
@@ -68,6 +74,9 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
         ValueError: the format is unknown, a file for one clip would get several, a clip name leads out of the folder,
             or joints are missing in a format of rotations.
         OSError: a file cannot be written.
+
+    Warns:
+        UserWarning: rotations and bones of constant length place a joint more than a centimetre from its position.
     """
     path, format = Path(path), format_of(path, format)
     if format == "npz":
@@ -79,10 +88,14 @@ def write_motion(path: str | Path, motion: MotionSet, format: str | None = None)
             "ending) and the format"
         )
     with _staged(path) as stage:
-        for clip in motion:
-            write_clip(_path_of(stage, clip, format), replace(motion, clips=[clip]), format)
+        moved = {
+            "/".join(clip.key): write_clip(_path_of(stage, clip, format), replace(motion, clips=[clip]), format)
+            for clip in motion
+        }
         if not path.suffix:
             write_labels(stage / LABELS, motion, path / LABELS)
+    if note := _note_of_deviations(moved, format):
+        warnings.warn(note, stacklevel=2)
     return [_path_of(path, clip, format) for clip in motion]
 
 
@@ -102,13 +115,17 @@ def _staged(out: Path) -> Iterator[Path]:
                     file.replace(target)
 
 
-def write_clip(path: Path, motion: MotionSet, format: str) -> None:
-    """Write a set with one clip, with rotations if the format has them."""
+def write_clip(path: Path, motion: MotionSet, format: str) -> float:
+    """Write a set with one clip, with rotations if the format has them.
+
+    Returns:
+        Largest distance in metres between a joint and its place by rotations and bones; 0 in a format of positions.
+    """
     clip, skeleton = motion.clips[0], motion.skeleton
     if format == "csv":
         write_table(path, skeleton.names, clip.positions)
         skeleton.to_json(own_companion(path, SKELETON))
-        return
+        return 0.0
     if np.isnan(clip.positions).any():
         raise ValueError(
             f"clip {brief('/'.join(clip.key))} has missing joints, which {format} cannot represent; fill them in first "
@@ -116,9 +133,12 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
         )
     rotated = motion.with_rotations()
     clip, skeleton = rotated.clips[0], rotated.skeleton
+    rotations, positions = to_matrix(tensor_of(clip.rotations).double(), "quaternion"), tensor_of(clip.positions)
+    placed, _ = forward(skeleton.parents, rotations, skeleton.offsets.double(), positions[:, skeleton.root].double())
+    moved = float((placed - positions).norm(dim=-1).max())
     if format == "amass":
         write_amass(path, clip, skeleton)
-        return
+        return moved
     recording = Recording(skeleton.names, skeleton.parents, clip.positions, clip.rotations, up=skeleton.up)
     if skeleton.up != "y":  # animation programs expect y up
         recording = rotate_up(recording, "y")
@@ -130,6 +150,25 @@ def write_clip(path: Path, motion: MotionSet, format: str) -> None:
     root = recording.positions[:, skeleton.root]
     offsets = skeleton.offsets.numpy()
     write_bvh(path, names, list(skeleton.parents), offsets, recording.rotations, root, skeleton.fps)
+    return moved
+
+
+def _note_of_deviations(moved: Mapping[str, float], format: str) -> str:
+    """Return a sentence about the clip that a format of rotations changes most; "" if it changes none by a centimetre.
+
+    Args:
+        moved: largest distance in metres by clip.
+        format: format of the files.
+    """
+    clip = max(moved, key=moved.__getitem__)
+    n_moved = sum(distance > DEVIATION for distance in moved.values())
+    if not n_moved:
+        return ""
+    return (
+        f"{format} has rotations and bones of constant length, which move joints of {n_moved} of {len(moved)} clips by "
+        f"more than {100 * DEVIATION:.0f} cm, and those of {brief(clip)} by up to {100 * moved[clip]:.1f} cm; write "
+        "npz or csv, which have positions, or first add joints where a bone is not rigid (MotionSet.with_extra_joints)"
+    )
 
 
 def _path_of(path: Path, clip: Clip, format: str) -> Path:
@@ -215,13 +254,15 @@ def convert(
     reader = FileReader(world, metres is not None, up is not None, recorded, onto=onto, output_fps=fps, missing=missing)
     collected, skipped = Collected(out.stem), []
 
+    moved = {}
+
     def clips(stage: Path) -> Iterator[Clip]:
         work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="2*n_jobs", batch_size=1)
         here = None if jobs == 1 else Path.cwd()
         results = work(delayed(_convert_file)(reader, file, stage, format, skip_bad, here) for file in files)
         with closing(results), progress_bar(True) as bar:
             for file, result in bar.track(zip(files, results, strict=True), len(files), description="clips"):
-                reason = result if isinstance(result, str) else collected.add(file.path, *result)
+                reason = result if isinstance(result, str) else collected.add(file.path, *result[:3])
                 if reason and not skip_bad:
                     raise ValueError(reason)
                 if reason:
@@ -231,6 +272,7 @@ def convert(
                         path.unlink()
                         own_companion(path, SKELETON).unlink(missing_ok=True)
                 else:
+                    moved["/".join(result[0].key)] = result[3]
                     yield result[0]
         if len(skipped) == len(files):
             raise ValueError(f"none of the files can be read; the first: {skipped[0]}")
@@ -242,6 +284,8 @@ def convert(
             written_clips = list(clips(stage))
             if not out.suffix:
                 write_labels(stage / LABELS, written_clips, out / LABELS)
+    if deviations := _note_of_deviations(moved, format):
+        warnings.warn(deviations, stacklevel=2)
     note = f"; {len(skipped)} skipped, the first: {skipped[0]}" if skipped else ""
     return f"{len(files) - len(skipped)} clips; read as {collected.interpretation(world)}{note}"
 
@@ -279,21 +323,23 @@ def _renamed(motion: MotionSet, source: Path, sources: Sequence[Path], prefix: b
 
 def _convert_file(
     reader: FileReader, file: File, out: Path, format: str, skip_bad: bool, directory: Path | None
-) -> tuple[Clip, Skeleton, list[str]] | str:
+) -> tuple[Clip, Skeleton, list[str], float] | str:
     """Read one file, and write its clip unless all clips go into one npz.
 
     Returns:
-        Clip (its fullest frame if it was written), skeleton and notes; or the reason why the file cannot be used.
+        Clip (its fullest frame if it was written), skeleton, notes and the result of `write_clip`; or the reason why
+        the file cannot be used.
     """
     if directory:  # where relative paths start; a process may be left from a call in another directory
         os.chdir(directory)
     try:
         clip, skeleton, notes = reader(file)
         if format == "npz":
-            return clip, skeleton, notes
-        write_clip(_path_of(out, clip, format), MotionSet([clip], skeleton, copy=False, missing=reader.missing), format)
+            return clip, skeleton, notes, 0.0
+        motion = MotionSet([clip], skeleton, copy=False, missing=reader.missing)
+        moved = write_clip(_path_of(out, clip, format), motion, format)
         fullest = int(np.isnan(clip.positions).any(2).sum(1).argmin())
-        return clip.between(fullest, fullest + 1), skeleton, notes
+        return clip.between(fullest, fullest + 1), skeleton, notes, moved
     except ValueError as error:
         if not skip_bad:
             raise

@@ -1,5 +1,6 @@
 """Motion written for other programs, and `dvae data convert`."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -49,6 +50,24 @@ def test_formats_and_names_that_do_not_fit_are_errors(walkers, tmp_path):
         with pytest.raises(ValueError, match="leads out of the folder"):
             write_motion(tmp_path / "inner", outside, "csv")
     assert not list(tmp_path.rglob("*.csv"))
+
+
+@pytest.mark.filterwarnings("default:bvh has rotations")
+def test_joints_that_rotations_move_are_named(walkers, tmp_path, capsys):
+    """A pelvis that is not rigid has no rotation that fits all its bones."""
+    bent = walkers.clips[1].positions.copy()
+    hips = [WALKER.names.index(name) for name in ("LHip", "RHip")]
+    bent[:, hips, 0] += 0.1 * np.sin(np.arange(len(bent)))[:, None]
+    motion = MotionSet([walkers.clips[0], replace(walkers.clips[1], positions=bent)], WALKER)
+    message = r"move joints of 1 of 2 clips by more than 1 cm, and those of '\S+' by up to \d+\.\d cm; write npz or csv"
+    with pytest.warns(UserWarning, match=f"bvh has rotations .* {message}"):
+        write_motion(tmp_path / "bvh", motion, "bvh")
+    write_motion(tmp_path / "csv", motion, "csv")
+    assert main(["data", "convert", str(tmp_path / "csv"), "--out", str(tmp_path / "again"), "--format", "bvh"]) == 0
+    assert re.search(message, " ".join(capsys.readouterr().err.split()))
+    written = read_motion(tmp_path / "bvh", metres=0.01).clips[1].positions
+    assert np.linalg.norm(written - bent, axis=-1).max() > 0.01
+    write_motion(tmp_path / "extra", motion.with_extra_joints(), "bvh")
 
 
 def test_amass_files_have_the_members_that_readers_expect(walkers, tmp_path):
@@ -168,9 +187,11 @@ def test_an_error_leaves_no_files_and_skipped_clips_are_not_written(recordings, 
         assert main(["data", *wrong]) == 2
 
 
+@pytest.mark.filterwarnings("default:bvh has rotations")  # limbs of forecasts change their lengths
 def test_forecasts_of_a_run_are_written_as_bvh(run, tmp_path, capsys):
     assert main(["forecast", str(run), "--out", str(tmp_path / "one.bvh"), "--samples", "2"]) == 0
     notes = " ".join(capsys.readouterr().err.split())
+    assert "move joints of 1 of 1 clips by more than 1 cm" in notes
     assert "the first of 2 futures of 60 frames for each of 1 windows, after 15 observed frames" in notes
     assert "relative to the root: the protocol simulated removes the root's path" in notes
     motion_set = read_motion(
