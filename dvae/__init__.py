@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from .inference.evaluation.evaluate import evaluate
     from .inference.evaluation.evaluation import Evaluation
     from .inference.training import schedules
+    from .inference.training.checkpoints import load_weights
     from .inference.training.fit import Fit, fit
     from .inference.training.gradnorm import GradNorm
     from .inference.training.objectives import Evidence
@@ -109,6 +110,7 @@ __all__ = [
     "kl_gap",
     "linear_gaussian_surrogate",
     "load",
+    "load_weights",
     "method",
     "methods",
     "model_edge_costs",
@@ -158,6 +160,7 @@ _MODULES = {
         "inference.training.fit": "Fit fit",
         "inference.training.gradnorm": "GradNorm",
         "inference.training.objectives": "Evidence",
+        "inference.training.checkpoints": "load_weights",
         "inference.training.options": "Stage Training",
         "inference.training.svi": "SVI",
         "models.registry": "method methods",

@@ -25,6 +25,8 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from ..networks.loop import valid_steps
+from .batch import WHOLE, Batch
 from .blocks import ColumnSummary, blocks
 
 ROUNDING = 2e-15
@@ -96,6 +98,19 @@ EXACT = ("mean", "typical")
 """Buffers that may be in float64 whatever the precision of the model."""
 
 
+def known_values(batch: Batch, name: str) -> Tensor:
+    """Return values (..., D) of a variable, with NaN at missing entries and padding; integers become float64."""
+    values = torch.as_tensor(batch[name])
+    values = values if values.is_floating_point() else values.double()
+    mask, lengths = batch.mask(name), batch.lengths
+    if mask is not None and mask.shape == values.shape:
+        values = torch.where(torch.as_tensor(mask, device=values.device).bool(), values, torch.nan)
+    if lengths is not None and values.dim() == 3:
+        valid = valid_steps(torch.as_tensor(lengths, device=values.device), values.shape[1])
+        values = torch.where(valid[..., None], values, torch.nan)
+    return values
+
+
 class Units(nn.Module):
     """Standardisation with a mean for every coordinate and one common scale, which preserves angles.
 
@@ -105,6 +120,7 @@ class Units(nn.Module):
         size: D.
         coordinates: units of each column of a table, which replace the fitted ones.
         exact: keep means in float64 if they are given or fitted to float64 values.
+        variable: name of the values in a batch.
     """
 
     mean: Tensor
@@ -114,9 +130,9 @@ class Units(nn.Module):
     level: Tensor
     spread: Tensor
 
-    def __init__(self, size: int, coordinates: Sequence[Coordinate] = (), exact: bool = False):
+    def __init__(self, size: int, coordinates: Sequence[Coordinate] = (), exact: bool = False, variable: str = WHOLE):
         super().__init__()
-        self.exact = exact
+        self.exact, self.variable = exact, variable
         values = torch.tensor(coordinates, dtype=torch.float64).reshape(-1, len(Coordinate._fields))
         buffers = dict(zip(Coordinate._fields, values.T, strict=True)) if coordinates else {}
         for name, value in (buffers or {"mean": torch.zeros(size), "scale": torch.ones(())}).items():
@@ -125,16 +141,25 @@ class Units(nn.Module):
         self.logarithms = any(each.floor for each in coordinates)
 
     @torch.no_grad()
-    def fit(self, values: Tensor | np.ndarray) -> None:
+    def fit(self, values: Tensor | np.ndarray | Mapping[str, Any]) -> None:
         """Set mean and root mean variance from values (..., D), in memory or mapped, which are read in blocks.
 
-        Warns if float32 does not resolve how sequences (N, T, D) vary after their common mean is subtracted.
+        NaN is left out; of a batch, entries that its mask or lengths exclude are left out, too. Warns if float32 does
+        not resolve how sequences (N, T, D) vary after their common mean is subtracted.
 
         Raises:
+            TypeError: if the values are neither an array nor a batch.
             ValueError: if the values do not vary or have another size, or the units of the coordinates were given.
         """
         if self.scale.dim():
             raise ValueError("these coordinates have given units, which cannot be fitted; remove the call of fit")
+        if isinstance(values, Mapping):
+            values = known_values(Batch(values), self.variable)
+        if not hasattr(values, "shape"):
+            raise TypeError(
+                f"units need values (..., {len(self.mean)}) or a batch, got {type(values).__name__}; a batch of all "
+                "windows is windows.all()"
+            )
         size, variance = len(self.mean), 0.0
         if same_size := values.shape[-1] == size:
             summary = ColumnSummary.of(block.reshape(-1, size) for block in blocks(values))

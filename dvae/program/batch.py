@@ -15,7 +15,7 @@ from torch.nn import functional
 from ..capture import defer, is_deferring
 from ..data.batch import WHOLE, Batch
 from ..data.sequences import HeldOutWindows, has_splits, refuse_table, tensor_of
-from ..data.units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float32
+from ..data.units import RESOLVED, ROUNDING, SMALLEST, TOO_SMALL, exceeds_float32, known_values
 from ..data.views import View
 from ..distributions.product import ProductSupport
 from ..factorization.notation import Factorization
@@ -357,13 +357,7 @@ def _cast(name: str, value: Tensor, dtype: torch.dtype, batch: Batch) -> Tensor:
 
 def _moments(name: str, value: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation (D,) of the observed entries in float64; NaN without any."""
-    mask, lengths, values = batch.mask(name), batch.lengths, value.double()
-    if mask is not None and mask.shape == value.shape:
-        values = torch.where(torch.as_tensor(mask, device=value.device), values, torch.nan)
-    if lengths is not None and value.dim() == 3:
-        valid = valid_steps(torch.as_tensor(lengths, device=value.device), value.shape[1])
-        values = torch.where(valid[..., None], values, torch.nan)
-    rows = values.flatten(0, -2)
+    rows = known_values(batch | {name: value.double()}, name).flatten(0, -2)
     mean = rows.nanmean(0)
     return mean, (rows - mean).square().nanmean(0).sqrt()
 

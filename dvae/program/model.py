@@ -280,7 +280,7 @@ class DynamicalVAE(nn.Module):
                     "its parents"
                 )
             self.generator[name].exposure = exposure
-        units = Units(self.sizes[name], coordinates, exact=name not in self.latents)
+        units = Units(self.sizes[name], coordinates, exact=name not in self.latents, variable=name)
         self.units[name] = units.to(like(self))
         for conditional in (*self.generator.values(), *self.encoder.values()):
             conditional.units[name] = self.units[name]

@@ -229,6 +229,12 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     run = Run(path)
     with reading_config(path):
         config = run.config
+        if "method" not in config and "stages" in config:
+            raise CheckpointError(
+                f"{run.path} was fitted in Python on arrays, or with a model of your own, which a run does not store; "
+                "build the model as before, then load its weights by dvae.load_weights(model, path), or continue by "
+                "dvae.fit(model, data, out=path, resume=True)"
+            )
         if (version := config["format"]) != FORMAT:
             raise CheckpointError(
                 f"{run.path} is a run of format {version!r}, and this version of dvae reads format {FORMAT}; fit "

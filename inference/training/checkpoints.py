@@ -278,6 +278,17 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str]) -> None:
 
     Raises:
         CheckpointError: when the file is missing, damaged or of another model, or a weight is not finite.
+
+    Example:
+        >>> import tempfile
+        >>> def build():
+        ...     return dvae.DynamicalVAE("p(z_t | z_{t-1}) p(x_t | z_t)", "q(z_t | x_{1:T})", {"z": 1, "x": 2})
+        >>> model, again = build(), build()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = dvae.fit(model, torch.randn(6, 4, 2), steps=3, out=folder + "/run", progress=False)
+        ...     dvae.load_weights(again, folder + "/run")
+        >>> all(torch.equal(*pair) for pair in zip(model.parameters(), again.parameters()))
+        True
     """
     path = Path(path)
     most = state_bytes(model)

@@ -1,5 +1,7 @@
 """Units: networks see standardised variables; values and densities keep their own units."""
 
+import math
+
 import pytest
 import torch
 from pyro import poutine
@@ -90,6 +92,26 @@ def test_a_given_scale_is_in_the_unit_of_the_variable():
     model.standardise("x").fit(x)
     site = poutine.trace(model.model).get_trace(x).nodes["x"]
     assert torch.allclose(site["fn"].steps(x).scale, torch.tensor(0.3))
+
+
+def test_units_of_a_batch_leave_out_missing_entries_and_padding():
+    x, lengths, mask = 4 + torch.randn(5, 6, 3), torch.tensor([2, 3, 4, 5, 6]), torch.rand(5, 6, 3) < 0.8
+    known = mask & (torch.arange(6) < lengths[:, None])[..., None]
+    batch = {"x": torch.where(known, x, 1e3), "lengths": lengths, "mask": {"x": mask}}
+    units = dvae.DynamicalVAE(*PAIR, SIZES).standardise("x")
+    units.fit(batch)
+    expected = dvae.DynamicalVAE(*PAIR, SIZES).standardise("x")
+    expected.fit(torch.where(known, x, math.nan))
+    torch.testing.assert_close((units.mean, units.scale), (expected.mean, expected.scale))
+    assert (units.mean - 4).abs().max() < 2
+    with pytest.raises(TypeError, match=r"got ArrayWindows; a batch of all windows is windows.all\(\)"):
+        units.fit(dvae.ArrayWindows(x, 3))
+
+
+def test_a_mask_that_is_not_boolean_is_an_error():
+    model = dvae.DynamicalVAE(*PAIR, SIZES)
+    with pytest.raises(ValueError, match=r"the mask of x is torch.float32 \(5, 6, 3\); expected bool"):
+        dvae.fit(model, {"x": torch.randn(5, 6, 3), "mask": torch.ones(5, 6, 3)}, steps=1, progress=False)
 
 
 def far(mean, scale, distribution=None, network=None, **options):

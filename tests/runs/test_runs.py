@@ -550,6 +550,17 @@ def test_python_without_docstrings_is_an_error():
     assert "Traceback" not in error
 
 
+def test_a_run_of_arrays_names_how_to_load_its_weights(tmp_path):
+    model = dvae.method("vae").build({"x": 2})
+    dvae.fit(model, torch.randn(6, 4, 2), steps=2, out=tmp_path / "run", progress=False)
+    with pytest.raises(CheckpointError, match=r"which a run does not store; build the model .* by dvae.load_weights"):
+        dvae.load(tmp_path / "run")
+    again = dvae.method("vae").build({"x": 2})
+    dvae.load_weights(again, tmp_path / "run")
+    for one, other in zip(model.parameters(), again.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
 # Threads --------------------
 
 
