@@ -415,7 +415,7 @@ class HiTModel(EnergyModel):
 
     def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, **options: Any):
         super().__init__(method, skeleton, observed, **options)
-        joints = body_parts(skeleton, PARTS) if method.diversity else {}
+        joints = body_parts(skeleton, PARTS) if any(method.diversity or ()) else {}
         self.coordinates = {
             part: [3 * j + axis for j in members for axis in range(3)] for part, members in joints.items()
         }

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .parts import known_name
 from .skeleton import Skeleton, differences, inverse_lengths
 
 Vector: TypeAlias = "str | tuple[Vector, str, Vector]"
@@ -269,13 +270,13 @@ def angle_names(skeleton: Skeleton) -> tuple[str, ...]:
 
 
 def _angles(skeleton: Skeleton) -> tuple[Angle, ...]:
-    if skeleton.name not in ANGLES:
+    if (name := known_name(skeleton)) not in ANGLES:
         names = ", ".join(ANGLES)
         raise ValueError(
-            f"joint angles are defined for the skeletons {names}, not for {skeleton.name!r}; use angles=0 to train "
-            "without angle limits"
+            f"joint angles are defined for the skeletons {names} and those with the same joints, not for "
+            f"{skeleton.name!r}; use angles=0 to train without angle limits"
         )
-    return ANGLES[skeleton.name]
+    return ANGLES[name]
 
 
 class _Plan(NamedTuple):

@@ -35,6 +35,13 @@ LIMBS: dict[str, dict[str, tuple[str, ...]]] = {
 UNIONS = {"lower": ("right_leg", "left_leg"), "upper": ("torso", "left_arm", "right_arm")}
 
 
+def known_name(skeleton: Skeleton) -> str:
+    """Return the name of the skeleton in `LIMBS` that has the same name, or else the same joints; "" without one."""
+    joints = {name for joint, name in enumerate(skeleton.names) if joint != skeleton.root}
+    same = (name for name, limbs in LIMBS.items() if joints == {joint for limb in limbs.values() for joint in limb})
+    return skeleton.name if skeleton.name in LIMBS else next(same, "")
+
+
 def body_parts(skeleton: Skeleton, parts: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """Return the joints of each part.
 
@@ -82,13 +89,16 @@ def places_of(skeleton: Skeleton, members: Iterable[str]) -> tuple[int, ...]:
     Raises:
         ValueError: a name is unknown.
     """
-    limbs = LIMBS.get(skeleton.name, {})
+    limbs = LIMBS.get(known_name(skeleton), {})
     joints = [name for j, name in enumerate(skeleton.names) if j != skeleton.root]
     names: list[str] = []
     for member in members:
         for part in UNIONS.get(member, (member,)):
             if part not in limbs and part not in joints:
                 choices = ", ".join([*(UNIONS if limbs else ()), *limbs, *joints])
-                raise ValueError(f"skeleton {skeleton.name!r} has no part or joint {part!r}; it has {choices}")
+                raise ValueError(
+                    f"skeleton {skeleton.name!r} has no part or joint {part!r}; it has {choices}; define parts by "
+                    "joints, as in parts=('lower=LHip+RHip', ...) of gsps, or use diversity=(0, 0) in hit-dvae"
+                )
             names += limbs.get(part, (part,))
     return tuple(sorted(joints.index(part) for part in names))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -10,6 +12,7 @@ from dvae.motion import (
     estimate_angle_limits,
 )
 from dvae.motion.geometry.angles import angle_names, cosines
+from dvae.motion.geometry.parts import body_parts
 
 # A person facing +z with y up and left towards +x, arms hanging, legs straight, metres.
 STANDING = {
@@ -224,3 +227,16 @@ class TestLimits:
             estimate_angle_limits(torch.zeros(0, 48), WALKER)
         with pytest.raises(ValueError, match="wrong limits: b"):
             AngleLimits(("a", "b"), torch.tensor([0.0, 1.0]), torch.tensor([0.0, torch.nan]))
+
+
+def test_a_skeleton_with_the_joints_of_a_known_one_has_its_angles_and_parts():
+    own = replace(WALKER, name="recorded")
+    assert angle_names(own) == angle_names(WALKER)
+    assert body_parts(own, ("lower", "upper")) == body_parts(WALKER, ("lower", "upper"))
+    poses = random_poses(WALKER, 3)
+    torch.testing.assert_close(cosines(poses, own), cosines(poses, WALKER), equal_nan=True)
+    other = replace(own, names=tuple("Back" if name == "Spine" else name for name in own.names))
+    with pytest.raises(ValueError, match="not for 'recorded'; use angles=0"):
+        angle_names(other)
+    with pytest.raises(ValueError, match=r"'recorded' has no part or joint 'right_leg'; .* parts=\('lower=LHip\+RHip'"):
+        body_parts(other, ("lower", "upper"))
