@@ -36,7 +36,7 @@ from ..factorization.relations import MaskFunction
 from ..locking import serialized
 from ..networks import NetworkSpec, Recurrent
 from ..networks.loop import memoize
-from ..options import Range, kind_of, problem
+from ..options import Count, Range, kind_of, problem, require
 from .batch import CHUNK, AnyBatch, Reader
 from .conditional import Conditional, evaluating, like
 from .enumeration import Discrete, EnumerationPlan
@@ -599,8 +599,9 @@ class DynamicalVAE(nn.Module):
             Dictionary from variable name to draws (n, T, D), or (n, D) for a static latent.
 
         Raises:
-            ValueError: the batch is invalid, or the length is not known.
+            ValueError: the batch is invalid, the length is not known, or `n` is below 1.
         """
+        require(Count, n=n)
         with self.running():
             data = self.read(batch, size=n)
             return self.to_data_space(self.model(data, length=length, size=n), data)

@@ -174,7 +174,8 @@ def _of_all(measure: Measure, windows: HeldOutWindows) -> Measure:
     """Return the score of all columns together, in the unit of the data."""
     units = dict.fromkeys(columns_of(windows).values())
     if scales := scales_of(windows):
-        note = "scales: scores over all columns divide each column by its scale in the training data"
+        note = "scales: scores over all columns divide each column by its scale in the training data, the standard "
+        note += "deviation, or the mean of counts and positive columns"
         means = windows.description.get("means", [0.0] * len(scales))
         return replace(measure, function=_in_scales(measure.function, means, scales), unit="scales", note=note)
     mixed_note = (

@@ -10,7 +10,17 @@ from ...options import check
 from ..files import read_motion
 from ..files.reading import select_joints
 from .clips import MotionSet
-from .protocols import PROTOCOLS, Poses, Protocol, Representation, RootMotion, Windows, named_protocol, windows
+from .protocols import (
+    PROTOCOLS,
+    Poses,
+    Protocol,
+    Representation,
+    RootMotion,
+    Windows,
+    check_rate,
+    named_protocol,
+    windows,
+)
 from .simulator import simulate
 
 SIMULATED = "simulated"
@@ -147,7 +157,12 @@ class MotionData:
         return windows(self.motion, self.protocol, split)
 
     def parts(self) -> dict[str, str]:
-        """Return one sentence for each split: its number of windows, and the clips that are too short."""
+        """Return one sentence for each split: its number of windows, and the clips that are too short.
+
+        Raises:
+            ValueError: motion and protocol have different frame rates.
+        """
+        check_rate(self.motion, self.protocol)
         sentences, protocol = {}, self.protocol
         for split in ("train", "validation", "test"):
             try:

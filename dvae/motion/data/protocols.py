@@ -283,6 +283,20 @@ def _describe(representation: str) -> str:
     return travel + ("positions of joints" if form == "positions" else f"rotations of joints as {form}")
 
 
+def check_rate(motion: MotionSet, protocol: Protocol) -> None:
+    """Check that motion has the frame rate of a protocol.
+
+    Raises:
+        ValueError: it has another.
+    """
+    if motion.skeleton.fps != protocol.fps:
+        raise ValueError(
+            f"protocol {protocol.name} needs {protocol.fps:g} frames per second, but {motion.name!r} has "
+            f"{motion.skeleton.fps:g}; resample it (`dvae data convert FILE --fps {protocol.fps:g} --out NEW`, or "
+            "`MotionSet.resample` in Python), or choose another protocol"
+        )
+
+
 def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int | None = None) -> Windows:
     """Return the windows of a split.
 
@@ -298,11 +312,7 @@ def windows(motion: MotionSet, protocol: Protocol | str, split: str, length: int
     """
     if isinstance(protocol, str):
         protocol = named_protocol(protocol)
-    if motion.skeleton.fps != protocol.fps:
-        raise ValueError(
-            f"protocol {protocol.name} needs {protocol.fps:g} frames per second, but {motion.name!r} has "
-            f"{motion.skeleton.fps:g}; resample the motion with `MotionSet.resample`, or choose another protocol"
-        )
+    check_rate(motion, protocol)
     parts = _divide(motion, protocol)
     unknown = [name for name in split.split("+") if name not in parts]
     if unknown:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import dvae
 from dvae.motion import (
     HUMAN36M,
     HUMAN36M_KEPT,
@@ -441,3 +442,11 @@ class TestWindows:
         assert values["humaneva"] == (15, 60, 60)
         assert values["trajevae"] == (1, 100, 50)
         assert values["bandai2-by-style"] == values["cmu8"] == values["simulated"] == (15, 60, 30)
+
+
+def test_parts_of_data_with_another_frame_rate_are_an_error():
+    data = dvae.motion.MotionData("people", simulate(clips=4, frames=20), PROTOCOLS["h36m"])
+    with pytest.raises(
+        ValueError, match="needs 50 frames per second, .* resample it .*dvae data convert FILE --fps 50"
+    ):
+        data.parts()
