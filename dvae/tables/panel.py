@@ -440,6 +440,14 @@ def _split_frame(frame: Any, columns: Columns) -> tuple[list[Series], Calendar]:
         order = _id_order(keys)
         rows, keys = [rows[index] for index in order], keys.iloc[order]
         names = ["/".join(key) for key in zip(*(texts(keys[name]).fillna("") for name in columns.id), strict=True)]
+        spaced = {name.strip(): name for name in names if name != name.strip()}
+        if doubled := spaced.keys() & {*names}:
+            name = min(doubled)
+            warnings.warn(
+                f"{len(doubled)} sequences have the names of others with spaces around them, such as {spaced[name]!r} "
+                f"and {name!r}; if they are the same, strip the spaces",
+                stacklevel=3,
+            )
     row_times, calendar, series = None, Calendar(), []
     if columns.time is not None:
         moments = time_of(frame, columns.time, columns.decimal)

@@ -249,6 +249,12 @@ def test_times_are_read_in_every_notation(freq, notation):
     np.testing.assert_array_equal(panel.series[0].times, times.astype("datetime64[s]").astype(int))
 
 
+def test_ids_that_differ_by_spaces_are_warned_of():
+    frame = pd.DataFrame({"shop": np.repeat(["a", "a ", "b"], 3), "t": [0, 1, 2] * 3, "y": np.arange(9.0)})
+    with pytest.warns(UserWarning, match="1 sequences have the names of others with spaces .*, such as 'a ' and 'a'"):
+        assert len(Panel.of(frame, Columns((Column("y"),), time="t", id=("shop",)))) == 3
+
+
 def test_years_with_weeks_are_read_by_the_name_of_their_column():
     monday = pd.date_range("2019-12-02", periods=60, freq="W-MON")
     weeks = [int(each.strftime("%G%V")) for each in monday]
