@@ -20,7 +20,7 @@ from dvae.inference.evaluation.result import new_figure, styled
 from .results import DOCS
 
 ROOT = DOCS.parent / "dvae"
-EVERYWHERE = {"capture", "command", "files", "options", "locking", "lazy", "constants"}
+EVERYWHERE = {"__main__", "capture", "command", "files", "options", "locking", "lazy", "constants"}
 """Small modules that many packages use; the picture leaves them out."""
 
 WALK = {

@@ -516,6 +516,7 @@ def test_commands_forecast_report_and_impute_motion_with_gaps(fitted, tmp_path):
     np.testing.assert_allclose(forecasts["spread"][~forecasts["observed"]], spread[~forecasts["observed"]], rtol=1e-5)
 
 
+@pytest.mark.filterwarnings("default:bvh has rotations")
 def test_impute_writes_filled_motion_files(fitted, tmp_path, capsys):
     impute = ["impute", fitted, "--samples", "1"]
     assert main([*impute, "--filled", str(tmp_path / "all.npz")]) == 0

@@ -446,5 +446,5 @@ class TestWindows:
 
 def test_parts_of_data_with_another_frame_rate_are_an_error():
     data = dvae.motion.MotionData("people", simulate(clips=4, frames=20), PROTOCOLS["h36m"])
-    with pytest.raises(ValueError, match=r"needs 50 frames per second, .* `dvae data convert FILE --fps 50"):
+    with pytest.raises(ValueError, match=r"needs 50 frames per second, .*`dvae data convert FILE --fps 50"):
         data.parts()

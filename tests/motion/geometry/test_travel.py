@@ -155,6 +155,7 @@ def test_windows_of_both_representations_of_the_root_are_compared(simulated):
     assert any("bounds of vae: densities of velocities of the root" in note for note in table.notes)
 
 
+@pytest.mark.filterwarnings("default:bvh has rotations")
 @pytest.mark.parametrize("form", ["positions", "6d"])
 def test_forecasts_continue_the_path_in_a_bvh_file(people, form, tmp_path, capsys):
     run, out = str(tmp_path / "run"), tmp_path / "future.bvh"
@@ -166,6 +167,7 @@ def test_forecasts_continue_the_path_in_a_bvh_file(people, form, tmp_path, capsy
     notes = " ".join(capsys.readouterr().err.split())
     assert "the root travels" in notes
     assert "relative to the root" not in notes
+    assert ("bvh has rotations" in notes) == (form == "positions")
     loaded = dvae.load(run)
     clip = loaded.data.motion["test", "person_0013"]
     written = motion.read_motion(out, metres=0.01).clips[0].positions
