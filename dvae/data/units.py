@@ -99,12 +99,24 @@ EXACT = ("mean", "typical")
 
 
 def known_values(batch: Batch, name: str) -> Tensor:
-    """Return values (..., D) of a variable, with NaN at missing entries and padding; integers become float64."""
+    """Return values (..., D) of a variable, with NaN at missing entries and padding; integers become float64.
+
+    Raises:
+        ValueError: the batch lacks the variable, or its mask is not boolean or has another shape.
+    """
+    if name not in batch:
+        raise ValueError(f"the batch has no {name!r}; it has {', '.join(batch) or 'nothing'}")
     values = torch.as_tensor(batch[name])
     values = values if values.is_floating_point() else values.double()
-    mask, lengths = batch.mask(name), batch.lengths
-    if mask is not None and mask.shape == values.shape:
-        values = torch.where(torch.as_tensor(mask, device=values.device).bool(), values, torch.nan)
+    mask, lengths = batch.masks().get(name), batch.lengths
+    if mask is not None:
+        mask = torch.as_tensor(mask, device=values.device)
+        if mask.dtype is not torch.bool or mask.shape != values.shape:
+            raise ValueError(
+                f"the mask of {name} is {mask.dtype} {tuple(mask.shape)}; expected bool {tuple(values.shape)}, True "
+                "where an entry was observed"
+            )
+        values = torch.where(mask, values, torch.nan)
     if lengths is not None and values.dim() == 3:
         valid = valid_steps(torch.as_tensor(lengths, device=values.device), values.shape[1])
         values = torch.where(valid[..., None], values, torch.nan)

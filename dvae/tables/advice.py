@@ -64,7 +64,7 @@ def findings(panel: Panel, cut: Cut, guessed: bool) -> list[str]:
         *_serial(panel, times),
         *_split(panel, cut, guessed),
         *_season(panel, cut),
-        *(() if panel.columns.lags else _absent(times, panel.calendar)),  # with lags, the schema warns
+        *(() if panel.columns.lags or panel.calendar.skips_days else _absent(times)),  # with lags, the schema warns
         *dated,
         *_leaks(*compared),
         *_scales(columns, sequences),
@@ -88,7 +88,7 @@ def _spikes(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
         levels, counts = np.unique(cells[~np.isnan(cells)], return_counts=True)
         if column.role != "target" or column.family not in ROUNDED or column.rounding or not len(levels):
             continue
-        if len(levels) > 2 and _is_mark(levels, int(counts.argmax())):
+        if len(levels) > 2 and _is_mark(levels, counts, int(counts.argmax())):
             continue
         share, level, unit = counts.max() / counts.sum(), levels[counts.argmax()], resolution(levels)
         remedies = [f"rounding = {unit:g}"] if unit else []
@@ -112,7 +112,7 @@ def _marks(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
     for column, cells in zip(columns, values.T, strict=True):
         levels, counts = np.unique(cells[~np.isnan(cells)], return_counts=True)
         for place in {0, len(levels) - 1} if len(levels) > 2 and column.family != "category" else ():
-            if counts[place] > 1 and _is_mark(levels, place):
+            if _is_mark(levels, counts, place):
                 mark = f"{levels[place]:g}"
                 yield (
                     f"{counts[place]} values of {column.name!r} are {mark}, far from all others; if it marks missing "
@@ -120,10 +120,12 @@ def _marks(columns: Sequence[Column], values: np.ndarray) -> Iterator[str]:
                 )
 
 
-def _is_mark(levels: np.ndarray, place: int) -> bool:
-    """Return whether a level is a number of nines, such as -999, and far from all others."""
-    digits, others = f"{abs(levels[place]):.0f}", np.delete(levels, place)
-    return len(digits) > 1 and {*digits} == {"9"} and bool(abs(levels[place]) > 2 * abs(others).max())
+def _is_mark(levels: np.ndarray, counts: np.ndarray, place: int) -> bool:
+    """Return whether a repeated level is a number of nines, such as -999 or 99.9, and far from all others."""
+    digits, others = f"{abs(levels[place]):g}".replace(".", ""), np.delete(levels, place)
+    least = 2 if len(digits) > 2 else REPEATS
+    is_far = abs(levels[place]) > 2 * abs(others).max()
+    return len(digits) > 1 and {*digits} == {"9"} and bool(is_far and counts[place] >= least)
 
 
 def _serial(panel: Panel, times: Sequence[np.ndarray]) -> Iterator[str]:
@@ -133,8 +135,8 @@ def _serial(panel: Panel, times: Sequence[np.ndarray]) -> Iterator[str]:
         joined = np.concatenate(times)
         if (joined % 1 == 0).all() and SERIAL[0] <= joined.min() and joined.max() <= SERIAL[1]:
             yield (
-                f"the times {name!r}, such as {joined[0]:g}, are numbers; if they are days of a spreadsheet, convert "
-                "them by pandas.to_datetime(column, unit='D', origin='1899-12-30')"
+                f"the times {name!r}, such as {joined[0]:g}, are numbers; if they are days, convert them by "
+                "pandas.to_datetime(column, unit='D', origin='1899-12-30'), or origin='unix' if they are since 1970"
             )
 
 
@@ -180,9 +182,9 @@ def _season(panel: Panel, cut: Cut) -> Iterator[str]:
         )
 
 
-def _absent(times: Sequence[np.ndarray], calendar: Calendar) -> Iterator[str]:
+def _absent(times: Sequence[np.ndarray]) -> Iterator[str]:
     """Yield a sentence if the minority of the steps are longer than all others, so that rows may be absent."""
-    gaps = np.concatenate([np.empty(0), *map(calendar.gaps, times)])
+    gaps = np.concatenate([np.empty(0), *map(np.diff, times)])
     is_long = gaps > EVEN * np.median(gaps) if len(gaps) else np.zeros(1, bool)
     if 0 < is_long.mean() < MINORITY and gaps[~is_long].max() <= EVEN * gaps.min():
         yield (

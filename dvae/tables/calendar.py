@@ -37,8 +37,6 @@ FLAG = 20
 """Maximum number of distinct values of a flag or category."""
 EVEN = 1.3
 """Maximum ratio of longest gap to median, and of median to shortest gap, of evenly spaced steps; months are even."""
-FEW = 0.1
-"""Share of longer steps below which single rows are absent; nights or weekends have more."""
 USUAL_SEASONS = {"1D": 7, "1B": 5, "1MS": 12, "1ME": 12, "1BMS": 12, "1BME": 12}
 """Steps in a week of daily data, and in a year of monthly data."""
 LINEAR = 1e-5
@@ -47,8 +45,8 @@ _OFFSET = re.compile(r"(?:UTC)?[-+](?:[01]\d|2[0-3]):[0-5]\d", re.ASCII)
 _DAYS = ("MON", "TUE", "WED", "THU", "FRI", "SAT", "SUN")
 _DAY = f"(?:{'|'.join(_DAYS)})"
 _STEP = re.compile(rf"[1-9]\d{{0,3}}(?:D|B|MS|ME|BMS|BME|WOM-[1-4]{_DAY})|{_DAY}(?:-{_DAY}){{1,5}}", re.ASCII)
-WEEKS = 3
-"""Minimum number of weeks that show which days of the week have rows."""
+ENOUGH = 3
+"""Minimum number of days that show which hours, and of weeks that show which days of the week, have rows."""
 
 
 @dataclass(frozen=True)
@@ -137,21 +135,27 @@ class Calendar:
         calendar step continue by their median gap.
 
         Warns:
-            UserWarning: if some days last 23 or 25 hours, but the time zone has no clock changes; or if many steps of
-                dates are longer than the others, as over closing hours, and are not continued so.
+            UserWarning: if some days last 23 or 25 hours, but the time zone has no clock changes; or if dates leave out
+                some hours or days (`has_breaks`), and are not continued so.
         """
         import pandas as pd
 
         if self.kind == "dates" and count:
             local = self.local(times)
             inferred = _step(local)
+            is_short = times[-1] - times[0] < ENOUGH * 7 * DAY  # too short to show which days have no rows
             is_daily = inferred in (None, "1D")  # business days are days too
-            steps = (self.step, inferred) if is_daily else (inferred, self.step)
+            steps = (self.step, inferred) if is_daily or (is_short and self.skips_days) else (inferred, self.step)
             for step in filter(None, steps):
                 if (following := _following(local, step, count)) is not None:
-                    replace(self, step=step)._warn_of_breaks(times)
                     return self._seconds(following)
-            replace(self, step=None)._warn_of_breaks(times)
+            if self.has_breaks(times):
+                warnings.warn(
+                    "all rows are at some hours of the day or some days of the week, as with opening hours, but "
+                    "forecasts have even times; for other times, append rows with them and empty targets, or insert "
+                    "the absent rows with empty cells, for example by pandas' asfreq",
+                    stacklevel=2,
+                )
             if len(local) > 1 and _is_daily(local):  # regardless of clock changes
                 gap = (local[1:] - local[:-1]).to_series().median()
                 return self._seconds(pd.DatetimeIndex([local[-1] + gap * number for number in range(1, count + 1)]))
@@ -165,25 +169,17 @@ class Calendar:
         gap = np.median(np.diff(times)) if len(times) > 1 else self.gap or 1.0
         return np.asarray(times[-1] + gap * np.arange(1, count + 1))
 
-    def _warn_of_breaks(self, times: np.ndarray) -> None:
-        if self.has_breaks(times):
-            warnings.warn(
-                f"many steps up to {self.text(times[-1])} are longer than the others, as over closing hours, but "
-                "forecasts have even times; for other times, append rows with them and empty targets, or insert the "
-                "absent rows with empty cells, for example by pandas' asfreq",
-                stacklevel=3,
-            )
-
     def has_breaks(self, times: np.ndarray) -> bool:
-        """Return whether many steps between times (T,) are longer than the others, as over closing hours."""
-        gaps = self.gaps(times)
-        n_long = int((gaps > EVEN * np.median(gaps)).sum()) if len(gaps) else 0
-        return n_long >= WEEKS and n_long >= FEW * len(gaps)
+        """Return whether times (T,) with steps below a day leave out some times of the day or days of the week.
 
-    def gaps(self, times: np.ndarray) -> np.ndarray:
-        """Return the steps between times (T,), (T - 1,): in calendar steps if all dates follow them, else in time."""
-        grid = _grid(self.local(times), self.step) if self.step and len(times) > 1 else None
-        return np.diff(times if grid is None else grid[0])
+        Single absent rows do not: the times must span several days, or weeks.
+        """
+        gap = float(np.median(np.diff(times))) if self.kind == "dates" and len(times) > 2 else 0.0
+        if not 0 < gap < DAY or DAY % gap:
+            return False
+        local, span = seconds(self.local(times)), times[-1] - times[0]
+        skips_hours = span > ENOUGH * DAY and len(np.unique(local % DAY // gap)) < DAY / gap
+        return skips_hours or (span > ENOUGH * 7 * DAY and len(np.unique(local // DAY % 7)) < 7)
 
     def features(self, times: np.ndarray, names: Iterable[str]) -> np.ndarray:
         """Return calendar features (T, C) of dates (T,), at the local time of their zone.
@@ -322,7 +318,7 @@ def _step(local: Any) -> str | None:
         weekdays = local.day_of_week
         candidates = ["1B"] if days == 1 and (np.diff(weekdays) < 0).any() else []
         open_days = [name for number, name in enumerate(_DAYS) if (weekdays == number).any()]
-        if local[-1] - local[0] >= WEEKS * np.timedelta64(7, "D") and 1 < len(open_days) < 7:
+        if local[-1] - local[0] >= ENOUGH * np.timedelta64(7, "D") and 1 < len(open_days) < 7:
             candidates = candidates if open_days == [*_DAYS[:5]] else ["-".join(open_days)]
     candidates.append(f"{round(days)}D")
     valid = (step for step in candidates if _STEP.fullmatch(step))
@@ -333,23 +329,6 @@ def _following(local: Any, step: str, count: int) -> Any:
     """Return the next `count` dates by a calendar step; None if most given dates are not one such step apart."""
     import pandas as pd
 
-    grid = _grid(local, step)
-    if grid is None or (len(local) > 1 and np.median(np.diff(grid[0])) != 1):
-        return None
-    _, last, frequency, days = grid
-    following = pd.date_range(last, periods=count + 1, freq=frequency)[1:]
-    return (
-        following if days is None else following + pd.to_timedelta(np.minimum(days, following.days_in_month) - 1, "D")
-    )
-
-
-def _grid(local: Any, step: str) -> tuple[np.ndarray, Any, Any, int | None] | None:
-    """Return the positions of dates in steps, the last date, the pandas frequency, and the day of the month, if any.
-
-    None if some dates do not follow the step. The last date is the first of its month if the day is given.
-    """
-    import pandas as pd
-
     days, frequency = None, step
     if step.startswith(_DAYS):
         frequency = pd.offsets.CustomBusinessDay(weekmask=step.replace("-", " ").title())
@@ -358,5 +337,10 @@ def _grid(local: Any, step: str) -> tuple[np.ndarray, Any, Any, int | None] | No
         if (local.day != np.minimum(days, local.days_in_month)).any():
             return None
         local = local - pd.to_timedelta(local.day - 1, unit="D")
-    positions = pd.date_range(local[0], local[-1], freq=frequency).get_indexer(local)
-    return None if positions[0] != 0 or (positions < 0).any() else (positions, local[-1], frequency, days)
+    indices = pd.date_range(local[0], local[-1], freq=frequency).get_indexer(local)
+    if indices[0] != 0 or (indices < 0).any() or (len(local) > 1 and np.median(np.diff(indices)) != 1):
+        return None
+    following = pd.date_range(local[-1], periods=count + 1, freq=frequency)[1:]
+    return (
+        following if days is None else following + pd.to_timedelta(np.minimum(days, following.days_in_month) - 1, "D")
+    )

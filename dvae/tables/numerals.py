@@ -100,10 +100,7 @@ def read_numbers(
     if column.dtype.kind in "mMc" or isinstance(column.dtype, pd.PeriodDtype | pd.IntervalDtype):
         return Numbers(nothing, column.notna().to_numpy(), {})
     if decimal == "." or (decimal is None and hint in (None, ".")):
-        cells = column.to_numpy(object, na_value=np.nan)
-        plain = _plain(cells)
-        if hint is None and decimal is None and plain is not None and _are_thousands(cells, plain):
-            hint = ""
+        plain = _plain(column.to_numpy(object, na_value=np.nan))
         if plain is not None and (decimal or hint is None or not _has_large_whole(plain)):
             plain[np.isin(plain, sentinels)] = np.nan
             return Numbers(plain, np.zeros(len(column), bool), {})
@@ -169,11 +166,19 @@ def _has_large_whole(values: np.ndarray) -> bool:
     return bool(((np.abs(values) >= 100) & (values == np.trunc(values))).any())
 
 
-def _are_thousands(cells: np.ndarray, values: np.ndarray) -> bool:
+LOOKED_AT = 200_000
+"""Maximum number of rows that show whether a dot separates thousands."""
+
+
+def may_be_thousands(column: Any) -> bool:
     """Return whether texts with a dot may be thousands: all have three decimals, beside integers from 100 to 999."""
+    cells = column.iloc[:LOOKED_AT].dropna().to_numpy(object)
+    values = _plain(cells)
+    if values is None:
+        return False
     whole = values == np.trunc(values)
-    fractions, integers = values[~whole & ~np.isnan(values)], np.abs(values[whole])
-    if not len(fractions) or not ((integers >= 100) & (integers < 1000)).any():
+    integers = np.abs(values[whole])
+    if whole.all() or not ((integers >= 100) & (integers < 1000)).any():
         return False
     return bool((integers < 1000).all()) and all(_THOUSANDS.fullmatch(str(cell)) for cell in cells if "." in str(cell))
 

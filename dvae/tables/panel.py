@@ -137,10 +137,10 @@ class Panel:
 
     @property
     def usual_season(self) -> int:
-        """`Calendar.usual_season`; 0 if some of the first sequences have breaks, as over closing hours."""
+        """`Calendar.usual_season`; 0 if most of the first sequences have breaks, as with opening hours."""
         times = [sequence.times for sequence in self.series[:SERIES] if sequence.times is not None]
         season = self.calendar.usual_season
-        return 0 if season and any(map(self.calendar.has_breaks, times)) else season
+        return 0 if season and 2 * sum(map(self.calendar.has_breaks, times)) > len(times) else season
 
     def _with_rounding(self) -> Columns:
         """Return the columns with the unit of their values in place of "auto"."""

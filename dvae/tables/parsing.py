@@ -172,7 +172,8 @@ def _offsets(strings: Any) -> Any:
 
 def n_offsets(column: Any) -> int:
     """Return the number of different offsets from UTC in dates; 0 if they are not texts."""
-    return int(_offsets(column).nunique()) if column.dtype.kind == "O" else 0
+    offsets = _offsets(column).replace({"Z": "+0000"}) if column.dtype.kind == "O" else column[:0]
+    return int(offsets.str.replace(":", "").nunique()) if len(offsets) else 0
 
 
 def compact(numbers: np.ndarray, name: Any = "") -> Any:
@@ -180,7 +181,7 @@ def compact(numbers: np.ndarray, name: Any = "") -> Any:
 
     Args:
         numbers: integers (N,).
-        name: name of the column; six digits are a year and an ISO week if it contains "week", and a month otherwise.
+        name: name of the column; six digits are a year and an ISO week if it is "week", and a month otherwise.
     """
     import pandas as pd
 
@@ -188,7 +189,7 @@ def compact(numbers: np.ndarray, name: Any = "") -> Any:
     for digits, pattern in COMPACT.items():
         if least // 10 ** (digits - 4) >= 1800 and most // 10 ** (digits - 4) <= 2200:
             cells = pd.Series(numbers.astype(int).astype(str))
-            if digits == 6 and "week" in str(name).lower():
+            if digits == 6 and re.search(r"(^|_)(iso_?|year_?)?week(_|$)", str(name).lower()):
                 cells, pattern = cells + "1", "%G%V%u"
             parsed = pd.to_datetime(cells, format=pattern, errors="coerce")
             return None if parsed.isna().any() else parsed

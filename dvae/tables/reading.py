@@ -37,7 +37,7 @@ from ..options import nearest
 from .column_inference import ColumnHints
 from .columns import MOST, Columns, layout, parsed
 from .domains import DOMAINS, domain
-from .numerals import decimal_sign
+from .numerals import decimal_sign, may_be_thousands
 from .panel import SPLITS, Panel, Series, plain_columns
 from .protocol import Cut
 
@@ -121,6 +121,8 @@ def _read_text(content: bytes, separators: str) -> Any:
         )
     if separator != ",":
         frame.attrs["decimal"] = decimal_sign(frame)
+    elif any(may_be_thousands(frame[name]) for name in frame) and decimal_sign(frame) != ".":
+        frame.attrs["decimal"] = ""
     if len(frame) and frame.iloc[:, -1].isna().any():
         _warn_of_shorter_rows(full_content, separator)
     return _without_empty_end(frame, content)

@@ -415,7 +415,10 @@ class HiTModel(EnergyModel):
 
     def __init__(self, method: HiTDVAE, skeleton: Skeleton, observed: int, **options: Any):
         super().__init__(method, skeleton, observed, **options)
-        joints = body_parts(skeleton, PARTS) if any(method.diversity or ()) else {}
+        try:
+            joints = body_parts(skeleton, PARTS) if any(method.diversity or ()) else {}
+        except ValueError as error:
+            raise ValueError(f"the diversity of parts needs {' and '.join(PARTS)}; use diversity=(0, 0)") from error
         self.coordinates = {
             part: [3 * j + axis for j in members for axis in range(3)] for part, members in joints.items()
         }

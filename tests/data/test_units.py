@@ -104,6 +104,10 @@ def test_units_of_a_batch_leave_out_missing_entries_and_padding():
     expected.fit(torch.where(known, x, math.nan))
     torch.testing.assert_close((units.mean, units.scale), (expected.mean, expected.scale))
     assert (units.mean - 4).abs().max() < 2
+    with pytest.raises(ValueError, match=r"the mask of x is torch.bool \(5, 6\); expected bool \(5, 6, 3\)"):
+        units.fit({"x": x, "mask": mask[..., 0]})
+    with pytest.raises(ValueError, match="the batch has no 'x'; it has y"):
+        units.fit({"y": x})
     with pytest.raises(TypeError, match=r"got ArrayWindows; a batch of all windows is windows.all\(\)"):
         units.fit(dvae.ArrayWindows(x, 3))
 

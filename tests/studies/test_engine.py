@@ -59,7 +59,7 @@ def test_an_archive_has_the_same_bytes_for_the_same_measurements(tmp_path):
     assert archives[0].file.read_bytes() == archives[1].file.read_bytes()
 
 
-def test_processes_add_to_one_archive_at_once(tmp_path):
+def test_scores_are_added_to_one_archive_at_once(tmp_path):
     names = [*"abcdefgh"]
     with ThreadPoolExecutor(len(names)) as pool:
         list(pool.map(lambda name: engine.Archive(tmp_path / "scores.zip").add(name, {"clips": {"a": 2}}), names))

@@ -145,14 +145,17 @@ def test_numbers_that_mark_missing_values_are_named():
     values[0, ::50, 0] = -999
     (text,) = found(values)
     assert text.startswith("6 values of 'x0' are -999, far from all others; if it marks missing values, set na_values")
-    values[0, ::50, 0] = -9  # a possible temperature
-    assert not found(values)
+    for level in (-9, 98.6, 45.0):  # possible values
+        values[0, ::50, 0] = level
+        assert not found(values)
+    values[0, ::50, 0] = 99.9
+    assert "are 99.9, far" in found(values)[0]
 
 
 def test_days_of_a_spreadsheet_are_named():
     series, columns = [Series("a", noise(50, 1), 45_000.0 + np.arange(50))], Columns((Column("y"),), time="Date")
     (text,) = findings(Panel(series, columns), Cut(3, 1, split="time"), False)
-    assert text.startswith("the times 'Date', such as 45000, are numbers; if they are days of a spreadsheet")
+    assert text.startswith("the times 'Date', such as 45000, are numbers; if they are days, convert them by")
     series = [replace(series[0], times=np.arange(50.0))]
     assert not findings(Panel(series, columns), Cut(3, 1, split="time"), False)
 

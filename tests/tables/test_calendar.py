@@ -71,11 +71,29 @@ def test_a_week_without_some_days_is_a_season():
 
 
 def test_forecasts_over_closing_hours_cause_a_warning():
-    hours = pd.date_range("2023-01-02", periods=24 * 20, freq="h")
-    frame = frame_of(hours[(hours.hour >= 9) & (hours.hour < 17)])
-    with pytest.warns(UserWarning, match="many steps up to 2023-01-21 16:00:00 are longer than the others, as over"):
-        assert future(frame)[0] == pd.Timestamp("2023-01-21 17:00")
-    assert Panel.of(frame).usual_season == 0
+    hours = pd.date_range("2023-01-02", periods=24 * 40, freq="h")
+    opening, weekdays = hours[(hours.hour >= 9) & (hours.hour < 17)], hours[hours.day_of_week < 5]
+    for times in (opening, weekdays):
+        with pytest.warns(UserWarning, match="all rows are at some hours of the day or some days of the week"):
+            assert future(frame_of(times))[0] == times[-1] + pd.Timedelta("1h")
+        assert Panel.of(frame_of(times)).usual_season == 0
+    random = np.random.default_rng(0)
+    for times in (hours, hours[np.sort(random.permutation(len(hours))[:800])], hours[9:17]):  # all, some, a few hours
+        future(frame_of(times))
+        assert Panel.of(frame_of(times)).usual_season == 24
+
+
+def test_a_short_sequence_keeps_the_days_of_the_others():
+    days = pd.date_range("2024-01-01", periods=90)
+    for keeps, length, following in (((0, 2, 4), 3, "2024-01-08"), ((0, 1, 2, 3, 4, 5), 5, "2024-01-06")):
+        long = days[np.isin(days.day_of_week, keeps)]
+        data = PanelData.of(
+            pd.concat([frame_of(long, shop="a"), frame_of(long[:length], shop="b")]),
+            ColumnHints(("y",), id=("shop",), time="time"),
+            Cut(2, 1, split="time"),
+        )
+        times, calendar = data.ahead(1).times(3)
+        assert calendar.to_pandas(times[1, 2:])[0] == pd.Timestamp(following)
 
 
 WORKDAYS = [seconds(pd.bdate_range("2024-01-01", periods=count)) for count in (12, 12, 1)]

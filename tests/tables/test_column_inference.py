@@ -427,9 +427,9 @@ def test_thousands_are_not_read_as_fractions(tmp_path, sign, separator):
 def test_thousands_with_a_dot_are_ambiguous_between_commas(tmp_path):
     days = pd.date_range("2024-01-01", periods=60).strftime("%Y-%m-%d")
 
-    def read_cells(cells, hints=None):
+    def read_cells(cells, hints=None, header="visitors"):
         lines = [f"{day},{cell}" for day, cell in zip(days, cells, strict=False)]
-        (tmp_path / "a.csv").write_text("\n".join(["day,visitors", *lines]) + "\n")
+        (tmp_path / "a.csv").write_text("\n".join([f"day,{header}", *lines]) + "\n")
         return read_panel(tmp_path / "a.csv", hints).series[0].values[:, 0]
 
     grouped = [f"{n:,}".replace(",", ".") for n in range(700, 2500, 30)]
@@ -441,6 +441,7 @@ def test_thousands_with_a_dot_are_ambiguous_between_commas(tmp_path):
     assert read_cells(grouped, ColumnHints(decimal="."))[10] == 1.0
     for other in ("1.5", "2500", "0.125"):  # no number of thousands
         assert read_cells([*grouped[1:], other])[9] == 1.0
+    assert read_cells([f"{cell},{n}.5" for n, cell in enumerate(grouped)], header="visitors,price")[10] == 1.0
 
 
 @pytest.mark.parametrize("cell", ["2024-02-30", "2024-13-01", "2024-01-xx", "soon"])

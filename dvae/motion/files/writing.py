@@ -167,7 +167,8 @@ def _note_of_deviations(moved: Mapping[str, float], format: str) -> str:
     return (
         f"{format} has rotations and bones of constant length, which move joints of {n_moved} of {len(moved)} clips by "
         f"more than {100 * DEVIATION:.0f} cm, and those of {brief(clip)} by up to {100 * moved[clip]:.1f} cm; write "
-        "npz or csv, which have positions, or first add joints where a bone is not rigid (MotionSet.with_extra_joints)"
+        "npz or csv, which have positions; if bones of constant length share a joint and move against each other, "
+        "MotionSet.with_extra_joints adds joints for them"
     )
 
 

@@ -97,8 +97,8 @@ def places_of(skeleton: Skeleton, members: Iterable[str]) -> tuple[int, ...]:
             if part not in limbs and part not in joints:
                 choices = ", ".join([*(UNIONS if limbs else ()), *limbs, *joints])
                 raise ValueError(
-                    f"skeleton {skeleton.name!r} has no part or joint {part!r}; it has {choices}; define parts by "
-                    "joints, as in parts=('lower=LHip+RHip', ...) of gsps, or use diversity=(0, 0) in hit-dvae"
+                    f"skeleton {skeleton.name!r} has no part or joint {part!r}; it has {choices}; define "
+                    "a part by its joints, as in 'lower=LHip+RHip'"
                 )
             names += limbs.get(part, (part,))
     return tuple(sorted(joints.index(part) for part in names))

@@ -11,6 +11,7 @@ from dvae.cli import main
 from dvae.motion import (
     HUMAN36M,
     WALKER,
+    Clip,
     MotionSet,
     Protocol,
     Skeleton,
@@ -67,6 +68,15 @@ def test_joints_that_rotations_move_are_named(walkers, tmp_path, capsys):
     assert re.search(message, " ".join(capsys.readouterr().err.split()))
     written = read_motion(tmp_path / "bvh", metres=0.01).clips[1].positions
     assert np.linalg.norm(written - bent, axis=-1).max() > 0.01
+
+
+def test_extra_joints_keep_the_positions_of_bones_that_share_a_joint(tmp_path):
+    angle = np.linspace(1, 2, 12)
+    positions = np.zeros((12, 3, 3))
+    positions[:, 1, 0], positions[:, 2, 0], positions[:, 2, 1] = 1, np.cos(angle), np.sin(angle)
+    motion = MotionSet([Clip("test", "a", positions)], Skeleton(("root", "a", "b"), (-1, 0, 0)))
+    with pytest.warns(UserWarning, match=r"MotionSet.with_extra_joints adds joints for them$"):
+        write_motion(tmp_path / "bent", motion, "bvh")
     write_motion(tmp_path / "extra", motion.with_extra_joints(), "bvh")
 
 
