@@ -8,7 +8,7 @@ observed value has variance 0. At a missing entry the model reads its own mean, 
 from __future__ import annotations
 
 import math
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any
 
 import torch
@@ -63,6 +63,8 @@ class GaussianFilter:
 
     def __init__(self, model: Any, known: Rollout, live: bool):
         self.model, self.known, self.live = model, known, live
+        # float32 does not resolve affine functions of a variable far from 0
+        self.exact_model = deepcopy(model).double() if like(model).dtype is not torch.float64 else model
         order = [name for block in model.generative.blocks for name in block.names]
         read = {parent.name for factor in model.generative.factors for parent in factor.parents}
         unread = [name for name in model.observed if name not in read]  # forgotten at the end of each step
@@ -190,11 +192,11 @@ class GaussianFilter:
 
         R is 1, or B if the variable reads context. S includes variables of its own step.
         """
-        conditional, (batch, size) = self.model.generator[name], self.mean.shape
+        conditional, (batch, size) = self.exact_model.generator[name], self.mean.shape
         probes = torch.cat([self.mean.new_zeros(1, size), torch.eye(size).to(self.mean)])
         names = [n for n in conditional.parents if n in self.model.context]
         count = batch if names else 1
-        probes, values = probes.repeat(count, 1).to(like(self.model)), {}
+        probes, values = probes.repeat(count, 1).to(like(self.exact_model)), {}
         for each in self.statics:
             if conditional.factor.parent(each) is not None:
                 values[each] = probes[:, self._part(each, 0)]
@@ -209,6 +211,7 @@ class GaussianFilter:
             elif value.dim() == 3:
                 value = value[:, :steps]
             values[each] = value.repeat_interleave(size + 1, 0)
+        values = {each: value.to(probes) for each, value in values.items()}
         location, scale = conditional(values, len(probes), max(steps, 1))
         if conditional.factor.local:
             location, scale = location[:, -1], scale[:, -1]

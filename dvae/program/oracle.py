@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 import torch
 from torch import Tensor
+from torch.func import functional_call
 
 from ..distributions.families import FixedNormal
 from ..distributions.family import Family
@@ -141,7 +142,6 @@ class Oracle:
             raise ValueError(
                 f"{type(model).__name__} has penalties, so its joint is not normal; use a model without them"
             )
-        # float32 does not resolve affine functions of a variable far from 0
         self.model, self.steps = deepcopy(model).double() if model.wide else model, steps
         for name in model.summed:
             if other := [parent for parent in model.generator[name].parents if parent not in model.summed]:
@@ -202,11 +202,14 @@ class Oracle:
             data: names of the variables d that the system reads.
             run: run over a batch with missing entries or padding; None for complete sequences.
         """
+        # float32 does not resolve affine functions of a variable far from 0
+        exact = self.model if like(self.model).dtype is torch.float64 else deepcopy(self.model).double()
+        exact_conditionals = exact.generator if conditionals is self.model.generator else exact.encoder
         columns = (*names, *data)
         valid, valid_own = (self._count_mask(each, run, observed=False) for each in (columns, names))
         rows, count = valid.shape
         probes = torch.cat([valid.new_zeros(rows, 1, count), torch.diag_embed(valid)], dim=1).flatten(0, 1)
-        parts = probes.to(like(self.model)).split([self._size(name) for name in columns], dim=1)
+        parts = probes.to(like(exact)).split([self._size(name) for name in columns], dim=1)
         values = {
             name: part.unflatten(1, (self.steps, -1)) if self.model.generative.local(name) else part
             for name, part in zip(columns, parts, strict=True)
@@ -218,7 +221,9 @@ class Oracle:
         for name in names:
             conditional = conditionals[name]
             self._require_linear(conditional)
-            location, scale = conditional(values, len(probes), self.steps, lengths)
+            parameters = {key: value.double() for key, value in conditional.named_parameters()}
+            arguments = values, len(probes), self.steps, lengths
+            location, scale = functional_call(exact_conditionals[name], parameters, arguments)
             located.append(location.flatten(1).unflatten(0, (rows, -1)).double())
             scales.append(scale.flatten(1).unflatten(0, (rows, -1))[:, 0].double())
         location = torch.cat(located, dim=2) * valid_own[:, None]

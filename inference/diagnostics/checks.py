@@ -66,7 +66,8 @@ def _roughness(x: Tensor) -> Tensor:
 
 def _correlation_length(x: Tensor) -> Tensor:
     length = x.shape[-2]
-    centred = x - mean_of_known(x, -2).unsqueeze(-2)
+    is_constant = (x == x[..., :1, :]) | x.isnan()  # whose mean rounding errors may shift
+    centred = torch.where(is_constant.all(-2, keepdim=True), 0.0, x - mean_of_known(x, -2).unsqueeze(-2))
     products = (centred[..., lag:, :] * centred[..., : length - lag, :] for lag in range(length))
     lags = [(1 - lag / length) * mean_of_known(product, (-2, -1)) for lag, product in enumerate(products)]
     below = torch.stack(lags, -1) < lags[0][..., None] / math.e

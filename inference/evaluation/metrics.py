@@ -439,9 +439,10 @@ def over_observed(score: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor
         missing = truth.isnan()
         if missing.any():
             frames = ~missing.all(-1)
-            samples, truth = (torch.where(missing, 0.0, values)[..., frames, :] for values in (samples, truth))
+            samples, truth = (torch.where(missing, 0.0, values) for values in (samples, truth))
             if not frames.any():
                 return score(samples, truth) * math.nan
+            samples, truth = samples[..., frames, :], truth[..., frames, :]
         return score(samples, truth)
 
     return observed_score

@@ -80,7 +80,10 @@ def forecast_score(model: Any, windows: Any, batch_size: int, seed: int, capture
     scale = scales(past)
     if not draws.isfinite().all():
         return math.inf
-    return float(continuous_ranked_probability_score(draws.movedim(0, 1) / scale, truth / scale).mean())
+    scores = continuous_ranked_probability_score(draws.movedim(0, 1) / scale, truth / scale)
+    if scores.isnan().all():
+        raise ValueError('no validation window has an observed future; select by the bound, select="bound"')
+    return float(mean_of_known(scores, 0))  # some futures may have no observed value
 
 
 def scales(past: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ def store(svi: SVI, run: Run) -> None:
         content |= {f"objective/{name}": value for name, value in svi.objective.state.items()}
     content = {name: value.detach().cpu().clone().contiguous() for name, value in content.items()}
     files = {LAST: save_tensors(weights(svi.model)), OPTIMISER: save_tensors(content)}
-    if state.best is not None and state.waited == 0:
+    if state.best is not None and not (run.exists and run.state["best_step"] == state.best_step):
         files[BEST] = save_tensors(state.best)
     fields = {name: getattr(state, name) for name in (*_STORED, "per")}
     run.commit({**fields, "optimizer": svi.training.optimizer, "select": svi.training.select}, files)

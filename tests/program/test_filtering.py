@@ -1,6 +1,7 @@
 """Online filtering: exact where the model is linear-Gaussian or discrete, and the same numbers however steps arrive."""
 
 import re
+from copy import deepcopy
 
 import pytest
 import torch
@@ -645,3 +646,16 @@ def test_a_caller_may_reuse_the_tensor_of_an_update():
             last = stream.update(buffer if reuses else buffer.clone())
         results.append(last.log_evidence)
     torch.testing.assert_close(*results, rtol=0, atol=0)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("mean", [0.0, 1000.0, 10_000.0])
+def test_exact_results_of_a_single_precision_model_are_those_in_double_precision(mean):
+    """Differences of locations far from 0 lose their digits in single precision."""
+    x = mean + torch.randn(4, T, 1)
+    pair = "p(z_t | z_{t-1}) p(x_t | z_t, x_{t-1})", "q(z_t | x_t)"
+    model = build(pair, {"z": 1, "x": 1}, Dense(()), FixedNormal(0.5)).float()
+    model.standardise("x").fit(x)
+    expected = Oracle(deepcopy(model).double(), T).evidence(x.double())
+    torch.testing.assert_close(Oracle(model, T).evidence(x), expected, rtol=0, atol=1e-8)
+    torch.testing.assert_close(model.filter(x).filtered.log_evidence.sum(1), expected, rtol=0, atol=1e-8)

@@ -73,9 +73,15 @@ def read_bvh(path: str | Path) -> Recording:
             angles = torch.from_numpy(np.deg2rad(values[:, columns]))
             rotations[:, indices] = to_matrix(angles, f"euler-{order}")
     names, parents = [joint.name for joint in joints], [joint.parent for joint in joints]
-    fps = 1 / seconds
-    fps = float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps
-    return Recording.turned(names, parents, offsets, rotations, fps=fps)
+    return Recording.turned(names, parents, offsets, rotations, fps=_rate(seconds))
+
+
+def _rate(seconds: float) -> float:
+    """Return frames per second: an integer, or 1000/1001 of one, whose period has the digits of these seconds."""
+    unit, rate = 10.0 ** -len(f"{seconds:.12f}".rstrip("0").partition(".")[2]), 1 / seconds
+    candidates = (float(round(rate)), round(1.001 * rate) / 1.001)
+    error = min(unit, 1.1e-3 * seconds)
+    return next((each for each in candidates if each and abs(1 / each - seconds) <= error), rate)
 
 
 def write_bvh(

@@ -69,6 +69,10 @@ def read_c3d(path: str | Path) -> Recording:
             "a positive rate and a finite scale"
         )
     numbers = np.frombuffer(content, kind, frames * row, _BLOCK * (start - 1)).reshape(frames, row)
+    if last == 0xFFFF:  # zeros may fill the last block
+        padding = numbers[frames - (_BLOCK - 1) // (kind.itemsize * row) :]
+        frames -= int(np.logical_and.accumulate((padding == 0).all(1)[::-1]).sum())
+        numbers = numbers[:frames]
     values = numbers[:, : 4 * markers].reshape(frames, markers, 4).astype(np.float64)
     places: np.ndarray = values[..., :3] * (1 if scale < 0 else scale)
     zero = np.asarray((values == 0).all(-1))

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from math import pi
+from math import hypot, nan, pi
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TextIO
@@ -346,11 +346,13 @@ class Skeleton:
     def sides(self) -> tuple[list[int], list[int]]:
         """Indices of the joints where the left and the right limbs leave the trunk: hips and shoulders.
 
+        A joint at the place of its parent, such as lhipjoint of CMU's files, counts as the trunk, if bone lengths or a
+        rest pose are known.
+
         Raises:
             ValueError: the skeleton does not define left and right.
         """
-        left = [joint for joint in self.left if self.parents[joint] not in self.left]
-        right = [joint for joint in self.right if self.parents[joint] not in self.right]
+        left, right = _leaving(self, self.left), _leaving(self, self.right)
         if not left or not right:
             raise ValueError(
                 f"skeleton {self.name!r} has no left and right joints, so it has no heading; give `left` and `right`"
@@ -367,8 +369,8 @@ class Skeleton:
             positions: (..., J, 3); joints of `sides` that are NaN are ignored.
 
         Returns:
-            Angles (...,), NaN if all joints of a side are NaN. `rotate_about_up(positions, -heading[..., None], up)`
-            rotates every pose to heading zero.
+            Angles (...,), NaN if all joints of a side are NaN, or if both sides are at one place.
+            `rotate_about_up(positions, -heading[..., None], up)` rotates every pose to heading zero.
 
         Raises:
             ValueError: the skeleton does not define left and right.
@@ -378,7 +380,8 @@ class Skeleton:
         left, right = (self._side(level.index_select(-2, indices(side, level))) for side in self.sides)
         across = left - right
         towards_x = 0.0 if plane[0] == 0 else pi / 2
-        return torch.atan2(across[..., 1], across[..., 0]) - towards_x
+        angle = torch.atan2(across[..., 1], across[..., 0]) - towards_x
+        return angle.masked_fill((across.abs() < SHORTEST).all(-1), nan)
 
     def heading_near(self, positions: Tensor, frame: int) -> Tensor:
         """Return the `heading` at a frame of motion with missing joints; 0 if no frame up to it has a heading.
@@ -473,6 +476,23 @@ class Skeleton:
 
 SHORTEST = 1e-6
 """Length in metres below which a vector has no direction."""
+
+
+@lru_cache(maxsize=64)
+def _leaving(skeleton: Skeleton, side: tuple[int, ...]) -> list[int]:
+    """Return the first joints of a side, below those that are at the place of their parents."""
+    norms = dict(zip([child for _, child in skeleton.edges], skeleton.lengths, strict=False))
+    if skeleton.rest:
+        norms = {joint: hypot(*skeleton.rest[3 * joint : 3 * joint + 3]) for joint in side}
+    leaving, pending = [], [joint for joint in side if skeleton.parents[joint] not in side]
+    while pending:
+        joint = pending.pop(0)
+        below = [child for child in side if skeleton.parents[child] == joint]
+        if norms.get(joint, 1.0) < SHORTEST and below:
+            pending = [*below, *pending]
+        else:
+            leaving.append(joint)
+    return leaving
 
 
 def inverse_lengths(vectors: Tensor, dim: int = -1) -> Tensor:

@@ -63,9 +63,10 @@ def median_final_displacement_error(samples: Array, truth: Array) -> Tensor:
 def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: bool = True) -> list[Tensor]:
     """Return the multimodal ground truth: for every window, the windows with almost the same last observed pose.
 
-    Two windows belong together if the Euclidean distance of their last observed poses is *below* the threshold, over
-    all coordinates; `distances` handles missing values. The default follows the evaluation of DLow (Yuan and Kitani
-    2020): a window belongs to itself. A window without others keeps its single truth and is scored like all windows.
+    Two windows belong together if the Euclidean distance of their last observed poses, relative to the root, is *below*
+    the threshold, over all coordinates; `distances` handles missing values. The default follows the evaluation of DLow
+    (Yuan and Kitani 2020): a window belongs to itself. A window without others keeps its single truth and is scored
+    like all windows.
     GSPS leaves such windows out of every metric (`several_futures`), so its published numbers are on a subset.
 
     Args:
@@ -84,7 +85,13 @@ def multimodal_truths(windows: HeldOutWindows, threshold: float = 0.5, itself: b
     if not threshold > 0:
         raise ValueError(f"the multimodal threshold must be a positive distance, got {threshold}")
     poses, known = last_places(Batch(windows.all()), observed)
-    poses = poses.double()
+    poses, skeleton = poses.double(), getattr(windows, "skeleton", None)
+    if skeleton is not None and poses.shape[-1] == 3 * skeleton.joints:
+        joints = poses.unflatten(-1, (-1, 3))
+        poses = (joints - joints[:, skeleton.root, None]).flatten(1)
+        if known is not None:
+            places = known.unflatten(-1, (-1, 3))
+            known = (places & places[:, skeleton.root, None]).flatten(1)
     truths: list[Tensor] = []
     for rows in torch.arange(len(poses)).split(512):
         close = distances(poses[rows], poses, None if known is None else known[rows], known) < threshold

@@ -392,7 +392,7 @@ def _most_typical(cycles: Sequence[tuple[np.ndarray, Clip]]) -> tuple[np.ndarray
 def _deviations(angle: np.ndarray, longest: int) -> np.ndarray:
     """Return standard deviations (F, K) of an angle (F,): at [s, k], of k + 1 frames from frame s; 0 after the end."""
     frames = np.arange(len(angle))[:, None] + np.arange(longest + 1)
-    sums, squares = (np.pad(np.cumsum(values), (1, longest), mode="edge") for values in (angle, angle**2))
+    sums, squares = (np.pad(np.cumsum([0.0, *values]), (0, longest), mode="edge") for values in (angle, angle**2))
     counts = np.arange(1, longest + 1)
     mean, square = ((total[frames[:, 1:]] - total[frames[:, :1]]) / counts for total in (sums, squares))
     inside = frames[:, :-1] < len(angle)

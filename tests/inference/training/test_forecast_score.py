@@ -153,3 +153,15 @@ def test_progress_names_the_score_that_selects():
     terminal.log(10, {"bound": 1.0, "validation/bound": 2.0, "validation/CRPS": 0.25})
     terminal.close()
     assert screen.getvalue() == "step 10/10  bound 1.000  validation bound 2.000  validation CRPS (selects) 0.250\n"
+
+
+def test_windows_without_an_observed_future_do_not_count():
+    mask = torch.ones_like(HELD_OUT, dtype=torch.bool)
+    mask[0, OBSERVED:] = False
+    some, others = ArrayWindows(HELD_OUT, OBSERVED, mask=mask), ArrayWindows(HELD_OUT[1:], OBSERVED)
+    model = build()
+    scores = [forecast_score(model, windows, 8, 0) for windows in (some, others)]
+    assert all(np.isfinite(scores))
+    mask[:, OBSERVED:] = False
+    with pytest.raises(ValueError, match="no validation window has an observed future; select by the bound"):
+        forecast_score(model, ArrayWindows(HELD_OUT, OBSERVED, mask=mask), 8, 0)

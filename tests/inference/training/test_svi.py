@@ -92,3 +92,26 @@ def test_steps_before_initialization_are_errors():
     loop.init()
     with pytest.raises(RuntimeError, match="taken since"):
         loop.row()
+
+
+def test_the_best_weights_of_earlier_validations_are_stored(tmp_path):
+    loop, run = dvae.SVI(build(), **SHARED), Run(tmp_path)
+    loop.init()
+    loop.step(TRAIN)
+    loop.validate(HELD_OUT)
+    store(loop, run)
+    for _ in range(4):
+        loop.step(TRAIN)
+    loop.validate(HELD_OUT)
+    assert loop.state.best_step == 5
+    with torch.no_grad():
+        for parameter in loop.parameters:
+            parameter += 1.0
+    loop.step(TRAIN)
+    loop.validate(HELD_OUT)
+    store(loop, run)
+    again = dvae.SVI(build(9), **SHARED)
+    again.init()
+    restore(again, run)
+    assert again.state.best_step == 5
+    assert same(again.state.best, loop.state.best)

@@ -173,3 +173,16 @@ def test_a_damaged_file_is_an_error_with_its_line(old, new, message, tmp_path):
     with pytest.raises(ValueError, match=message) as error:
         read_bvh(path)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fps"),
+    [
+        *(("0.0333", 30), ("0.033333", 30), ("0.0083333", 120), ("1", 1), ("2.5", 0.4), ("0.0123", 1 / 0.0123)),
+        *(("0.016683", 60 / 1.001), ("0.0333666", 30 / 1.001), ("0.041708", 24 / 1.001)),
+    ],
+)
+def test_a_rate_has_the_digits_of_its_frame_time(tmp_path, seconds, fps):
+    text = re.sub(r"Frame Time:.*", f"Frame Time: {seconds}", SMALL.replace("a knee", "knee"))
+    (tmp_path / "a.bvh").write_text(text)
+    assert read_bvh(tmp_path / "a.bvh").fps == pytest.approx(fps, rel=1e-9)

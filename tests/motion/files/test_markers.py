@@ -1,5 +1,7 @@
 """C3D files as ezc3d writes them, and the tree of markers."""
 
+import struct
+
 import numpy as np
 import pytest
 from c3d import write_c3d
@@ -73,3 +75,15 @@ def test_parents_of_markers_move_rigidly_with_them():
     assert all(parent < place for place, parent in enumerate(parents))
     crossing = [(order[parent] < 4) != (joint < 4) for joint, parent in zip(order, parents, strict=True) if parent >= 0]
     assert sum(crossing) == 1
+
+
+@pytest.mark.parametrize("frames", [65_535, 66_000])
+def test_zeros_that_fill_the_last_block_are_no_frames(tmp_path, frames):
+    """A header with 65,535 as its last frame may have more; this size of a frame leaves half a block."""
+    write_c3d(tmp_path / "a.c3d", ["HEAD", "HIP"], standing(15)[:, :2])
+    content = bytearray((tmp_path / "a.c3d").read_bytes())
+    content[8:10] = b"\xff\xff"
+    first = 512 * (struct.unpack_from("<H", content, 16)[0] - 1)
+    data = np.tile(standing(15)[:, :2], (frames // 15 + 1, 1, 1))[:frames].astype("<f4").tobytes()
+    (tmp_path / "a.c3d").write_bytes(content[:first] + data + bytes(-len(data) % 512))
+    assert read_c3d(tmp_path / "a.c3d").positions.shape == (frames, 2, 3)

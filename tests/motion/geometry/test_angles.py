@@ -238,5 +238,20 @@ def test_a_skeleton_with_the_joints_of_a_known_one_has_its_angles_and_parts():
     other = replace(own, names=tuple("Back" if name == "Spine" else name for name in own.names))
     with pytest.raises(ValueError, match="not for 'recorded'; use angles=0"):
         angle_names(other)
-    with pytest.raises(ValueError, match="'recorded' has no part or joint 'right_leg'; .* define a part by its joints"):
+    with pytest.raises(ValueError, match=r"has no part or joint 'right_leg'; .* define a part by its joints"):
         body_parts(other, ("lower", "upper"))
+
+
+@pytest.mark.parametrize("known", ["lengths", "rest"])
+def test_joints_at_the_place_of_their_parents_define_no_sides(known):
+    """CMU's files have lhipjoint and rhipjoint at the root."""
+    names = ("root", "lhipjoint", "lfemur", "rhipjoint", "rfemur")
+    rest = torch.tensor([[0, 0, 0], [0, 0, 0], [0.1, -0.1, 0], [0, 0, 0], [-0.1, -0.1, 0]])
+    options = {"rest": tuple(rest.flatten().tolist())} if known == "rest" else {"lengths": (0.0, 0.14, 0.0, 0.14)}
+    skeleton = Skeleton(names, (-1, 0, 1, 0, 3), left=(1, 2), right=(3, 4), **options)
+    assert skeleton.sides == ([2], [4])
+    assert skeleton.heading(rest) == pytest.approx(0.0, abs=1e-6)
+    turned = rest[:, [2, 1, 0]] * torch.tensor([1.0, 1.0, -1.0])  # faces +x
+    assert skeleton.heading(turned) == pytest.approx(torch.pi / 2, abs=1e-6)
+    unknown = Skeleton(names, (-1, 0, 1, 0, 3), left=(1, 2), right=(3, 4))
+    assert unknown.heading(rest).isnan()

@@ -9,7 +9,7 @@ import torch
 
 from dvae.motion import Clip, Cycles, MotionSet, Skeleton, gait_cycles, reference_cycles, simulate
 from dvae.motion.geometry import kinematics, rotations
-from dvae.motion.segments.gait import find_cycles, on_common_joints
+from dvae.motion.segments.gait import _deviations, find_cycles, on_common_joints
 
 SKELETON = simulate(clips=4, frames=60).with_rotations().skeleton
 
@@ -153,3 +153,11 @@ def test_two_sources_share_a_tree_and_keep_their_rest_poses(real):
             motion.clips[0].positions[:, motion_joints], source.clips[0].positions[:, source_joints]
         )
         assert len(gait_cycles(motion)) > 4 * len(motion) / 2
+
+
+def test_deviations_of_an_angle_equal_their_definition():
+    angle = np.random.default_rng(0).normal(3, 1, 20)
+    deviations = _deviations(angle, 6)
+    for start, count in ((0, 1), (0, 6), (7, 4), (14, 6)):
+        assert deviations[start, count - 1] == pytest.approx(angle[start : start + count].std(), abs=1e-7)
+    assert (deviations[15, 5:] == 0).all()
