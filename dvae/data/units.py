@@ -99,10 +99,14 @@ EXACT = ("mean", "typical")
 
 
 def known_values(batch: Batch, name: str) -> Tensor:
-    """Return values (..., D) of a variable, with NaN at missing entries and padding; integers become float64.
+    """Return values (..., D) of a variable, with NaN at missing entries and padding.
+
+    Args:
+        batch: batch with the variable; integers are converted to float64.
+        name: name of the variable.
 
     Raises:
-        ValueError: the batch lacks the variable, or its mask is not boolean or has another shape.
+        ValueError: the batch does not contain the variable, or its mask is not boolean or has another shape.
     """
     if name not in batch:
         raise ValueError(f"the batch has no {name!r}; it has {', '.join(batch) or 'nothing'}")

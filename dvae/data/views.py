@@ -55,7 +55,10 @@ class View:
 
     @property
     def quantity(self) -> str:
-        """Quantity that densities refer to, `measured` at the steps after those of `past`; "" for the data as given."""
+        """Quantity that densities refer to; "" for the data as given.
+
+        It consists of `measured` and, if the first steps are context (`past`), of the words "steps after the first".
+        """
         return ", ".join(filter(None, [self.measured, later_steps(self.past)]))
 
     @property

@@ -228,13 +228,13 @@ def pool(evaluations: Mapping[str, Evaluation], fitted: str) -> Backtest:
         return stacked
 
     def pooled(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-        """Return `pseudo_values` (C, ...) over all cutoffs of those of each cutoff (cutoffs, C, ...).
+        """Return the values (C, ...) of clusters over all cutoffs (see `pseudo_values`).
 
         Args:
-            values: pseudo-values.
+            values: values (cutoffs, C, ...) at each cutoff.
             counts: numbers of windows with a score (cutoffs, C).
         """
-        known, values = ~np.isnan(values), np.nan_to_num(values)
+        known, values, counts = ~np.isnan(values), np.nan_to_num(values), np.nan_to_num(counts)
         all_windows, counts = (each.reshape(*windows.shape, *[1] * (values.ndim - 2)) for each in (windows, counts))
         all_windows, counts = all_windows * known, counts * known
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -248,18 +248,18 @@ def pool(evaluations: Mapping[str, Evaluation], fitted: str) -> Backtest:
         of_method = [each.rows[method] for each in results]
         by_cutoff[method] = stack([row.cluster_means for row in of_method])
         histograms = stack([row.histograms for row in of_method])
-        parts = [row.counts for row in of_method]
-        names_of_parts = dict.fromkeys(name for part in parts for name in part)
-        whole = [np.array([*each.clusters.values()]) for each in results]
+        partial = {name for row in of_method for name in row.counts}
         counts = stack(
-            [{n: part.get(n, all_) for n in names_of_parts} for part, all_ in zip(parts, whole, strict=True)]
+            [
+                {name: row.counts.get(name, np.array([*each.clusters.values()])) for name in partial}
+                for row, each in zip(of_method, results, strict=True)
+            ]
         )
-        counts = {name: np.nan_to_num(each) for name, each in counts.items()}
         means, shares = (
             {name: pooled(values, counts.get(name, windows)) for name, values in each.items()}
             for each in (by_cutoff[method], histograms)
         )
-        totals = {name: each.sum(0).astype(int) for name, each in counts.items()}
+        totals = {name: np.nansum(each, 0).astype(int) for name, each in counts.items()}
         rows[method] = replace(of_method[0], cluster_means=means, histograms=shares, counts=totals)
     fingerprint = hashlib.sha256("".join(each.data["fingerprint"] for each in results).encode()).hexdigest()
     note = f"{len(results)} cutoffs, fitted {fitted}; first steps of the forecasts: {', '.join(evaluations)}"

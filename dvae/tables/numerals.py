@@ -171,7 +171,7 @@ LOOKED_AT = 200_000
 
 
 def may_be_thousands(column: Any) -> bool:
-    """Return whether texts with a dot may be thousands: all have three decimals, beside integers from 100 to 999."""
+    """Return whether dots may separate thousands: three digits follow each, and integers of three digits occur."""
     cells = column.iloc[:LOOKED_AT].dropna().to_numpy(object)
     values = _plain(cells)
     if values is None:

@@ -137,7 +137,7 @@ class Panel:
 
     @property
     def usual_season(self) -> int:
-        """`Calendar.usual_season`; 0 if most of the first sequences have breaks, as with opening hours."""
+        """Usual season of the calendar; 0 if most sequences have breaks, as with opening hours."""
         times = [sequence.times for sequence in self.series[:SERIES] if sequence.times is not None]
         season = self.calendar.usual_season
         return 0 if season and 2 * sum(map(self.calendar.has_breaks, times)) > len(times) else season

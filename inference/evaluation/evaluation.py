@@ -65,10 +65,15 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Scores of one method by cluster (see `Measure.pool`), its number of samples, equations and configuration.
+    """Scores of one method by cluster.
 
-    Histograms, such as the PIT's, have one share per bin for each cluster. `counts` has the number of windows with a
-    score, for scores that some windows lack.
+    Args:
+        samples: K, number of forecasts of each window.
+        cluster_means: `{score: (C,)}`, the values of `Measure.pool`.
+        equations: generative and inference factorization of a model.
+        config: configuration of the method.
+        histograms: `{histogram: (C, bins)}`, shares of the bins.
+        counts: `{score: (C,)}`, numbers of windows with a score, for scores that some windows lack.
     """
 
     samples: int
