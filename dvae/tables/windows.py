@@ -122,11 +122,14 @@ class PanelWindows:
 
     @property
     def left_out(self) -> str:
-        """Description of omitted sequences and windows; empty if none are omitted."""
+        """Description of omitted sequences, windows and last test steps; empty if none are omitted."""
         parts = [self.too_short] if self.skipped else []
         if self.n_unobserved:
             parts.append(f"{self.n_unobserved} windows without an observed target in their past or future")
-        return " and ".join(parts)
+        rest = (self._last - self._low) % self._stride
+        if self.split == "test" and rest.any():
+            parts.append(f"up to {int(rest.max())} steps at the end of {int((rest > 0).sum())} sequences, fewer than a stride")
+        return ", and ".join(parts)
 
     @property
     def too_short(self) -> str:

@@ -206,8 +206,8 @@ def posterior(
         Modes (B, ...) of the latents, their energies (B,) in nats, and the normal approximations at the modes.
 
     Raises:
-        ValueError: when the program has no latents, a site has no separate log-density for each sequence, or the prior
-            is not log-concave.
+        ValueError: when the program has no latents, a site has no separate log-density for each sequence, the prior is
+            not log-concave, or sequences have padding.
         FloatingPointError: when no start of a sequence has a finite energy.
 
     Example:
@@ -404,6 +404,11 @@ def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     """
     kind, curvature, prior = curvature, curvature.double(), prior.double()
     root, failed = torch.linalg.cholesky_ex(prior)
+    if (prior.diagonal(dim1=-2, dim2=-1) == 0).any():
+        raise ValueError(
+            "the prior does not depend on some latents, such as those after the last step of a shorter sequence; pass "
+            "sequences of one length, cut at their last step"
+        )
     if failed.any():
         raise ValueError(
             "the prior of the latents is not log-concave at the mode of the posterior, so its width cannot be "

@@ -28,7 +28,7 @@ from ..bounds.teacher_forced import bounds, filtered, information, length_of, va
 from .comparison import Comparison, ModelResult
 from .ensemble import Ensemble, require_same
 from .evaluate import evaluate
-from .evaluation_windows import on_device_of, refuse_non_finite, seeded_evaluation
+from .evaluation_windows import on_device_of, refuse_non_finite, require_readable, seeded_evaluation
 from .record import plain
 from .result import progress_bar
 from .scores import Measure, Scores, proper
@@ -146,6 +146,8 @@ def compare(
     if any(model.bounded for model in labelled.values()):
         particles = 1  # the same bound for all models
     batch = sequences(data).batch
+    for label, model in labelled.items():
+        require_readable(label, model, batch)
     sequence_ids = batch.group.tolist() if batch.group is not None else range(length_of(batch))
     keys = [("data", str(n), 0) for n in sequence_ids] if windows is None else cluster_keys(windows)
     contrast_indices = torch.randperm(len(keys), generator=torch.Generator().manual_seed(seed))[:contrasts]

@@ -32,7 +32,14 @@ from ..bounds.elbo import SequenceELBO, bound_notes, iwae_bound
 from ..bounds.predictive import has_ode, predictive_bound
 from .baselines import Forecaster
 from .evaluation import Evaluation, Row
-from .evaluation_windows import EvaluationWindows, on_device_of, prepare_windows, refuse_non_finite, seeded_evaluation
+from .evaluation_windows import (
+    EvaluationWindows,
+    on_device_of,
+    prepare_windows,
+    refuse_non_finite,
+    require_readable,
+    seeded_evaluation,
+)
 from .external import ForecastSamples
 from .record import plain
 from .references import References
@@ -131,6 +138,8 @@ def evaluate(
 
     if not (models or given or baselines):
         raise ValueError("expected at least one model, forecast or reference to score, got none")
+    for name, each in models.items():
+        require_readable(name, each, eval_windows.part(slice(0, 1)))
     rows: dict[str, Row] = {}
     with progress_bar(progress) as bar:
 

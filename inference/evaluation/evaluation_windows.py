@@ -137,6 +137,22 @@ def seeded_evaluation(model: nn.Module, seed: int) -> Iterator[None]:
         yield
 
 
+def require_readable(name: str, model: Any, batch: Batch) -> None:
+    """Raise an error that names the model if it cannot read sequences of a batch.
+
+    Args:
+        name: name of the model.
+        model: any model; only a `DynamicalVAE` is checked.
+        batch: the sequences; only the first is read.
+    """
+    if isinstance(model, DynamicalVAE):
+        try:
+            with seeded_evaluation(model, 0):
+                model.rollout(on_device_of(model, batch.rows(slice(0, 1))), guide=True)
+        except ValueError as error:
+            raise ValueError(f"{name} cannot read the data: {error}") from None
+
+
 def on_device_of(model: nn.Module, batch: Mapping[str, Any]) -> Batch:
     """Return the batch on the device of the model; a model that does not read batches also gets its floating type."""
     parameter = next(model.parameters())

@@ -226,7 +226,10 @@ def test_windows_without_an_observed_past_or_future_are_not_listed():
     one.values[start + 5 : start + 9, :2] = NAN
     windows = PanelWindows(panel, schema, "test")
     assert windows.keys == before[:2] + before[3:]
-    assert windows.left_out == "1 windows without an observed target in their past or future"
+    assert windows.left_out == (
+        "1 windows without an observed target in their past or future, and up to 3 steps at the end of 2 sequences, "
+        "fewer than a stride"
+    )
     one.values[start + 4 : start + 9, :2] = NAN  # the past of the next window, which begins at + 4
     windows = PanelWindows(panel, schema, "test")
     assert windows.keys == before[:2] + before[4:]

@@ -401,3 +401,12 @@ def test_densities_given_a_past_are_not_compared_with_densities_of_all_steps():
     models = {"past": past, "all": DynamicalVAE("p(x_t | x_{<t})", "", {"x": 2})}
     with pytest.raises(ValueError, match="steps after the first 4 given the first 4 for past, of the data for all"):
         run(models, ArrayWindows(torch.randn(8, 6, 2), 4))
+
+
+def test_a_model_of_other_columns_is_named():
+    models = {"narrow": DynamicalVAE(*DKF, {"z": 1, "x": 2}), "wide": DynamicalVAE(*DKF, {"z": 1, "x": 3})}
+    windows = ArrayWindows(torch.randn(8, 6, 2), 4)
+    message = r"wide cannot read the data: x has shape \(1, 6, 2\), expected \(B, T, 3\)"
+    for score in (run, evaluate):
+        with pytest.raises(ValueError, match=message):
+            score(models, windows)
