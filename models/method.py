@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from ..data.batch import WHOLE
 from ..data.schema import Schema, SchemaError
-from ..data.sequences import RandomMasking, interpolate_missing
+from ..data.sequences import RandomMasking, as_source, interpolate_missing
 from ..data.views import View
 from ..distributions import (
     FAMILIES,
@@ -38,6 +38,7 @@ from ..inference.training.recipe import Recipe, Trainable
 from ..inference.training.schedules import Cosine, Logistic, Ramp, Schedule
 from ..networks import NetworkSpec
 from ..options import Amount, Delay, Range, Share, Size
+from ..program.enumeration import Discrete
 from ..program.model import DynamicalVAE
 from ..program.rollout import ScheduledSampling
 
@@ -221,7 +222,8 @@ class LikelihoodMethod(Method):
         """Return the probability of scheduled sampling over a run of `steps`; 0 for a model that reads no data."""
         p, q = self.equations()
         reads = {parent.name for factor in p.factors for parent in factor.parents}
-        if not self.scheduled_sampling or not reads & (set(p.variables) - set(q.variables)):
+        discrete = {name for name, size in self.sizes().items() if isinstance(size, Discrete)}
+        if not self.scheduled_sampling or not reads & (set(p.variables) - set(q.variables) - discrete):
             return 0.0
         return rising(self.scheduled_sampling, steps)
 
@@ -293,7 +295,11 @@ class LatentMethod(LikelihoodMethod):
                 windows.
             SchemaError: if `hide` is set and the schema does not define which entries are observed together.
         """
-        batches = RandomMasking(train, self.hide, Schema.of(train, self.name).together) if self.hide else train
+        batches = train
+        if self.hide:
+            schema = Schema.of(train, self.name)
+            together = [0] * schema.size(WHOLE) if self.emission == "diffusion" else schema.together
+            batches = RandomMasking(as_source(train), self.hide, together)
         return replace(super().train(batches, validation, steps), prepare=partial(start_priors, train=train))
 
     @override
@@ -347,4 +353,4 @@ def start_priors(model: DynamicalVAE, train: Any) -> None:
     """Initialise the pseudo-sequences of a model's Vamp priors with windows of the training data, in its view."""
     for distribution in model.modules():
         if isinstance(distribution, VampModule):
-            distribution.start_at(model.read(train.sample(distribution.components, torch.default_generator)))
+            distribution.start_at(model.read(as_source(train).sample(distribution.components, torch.default_generator)))

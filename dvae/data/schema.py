@@ -72,7 +72,7 @@ class Schema:
     @property
     def together(self) -> Sequence[int]:
         """Label of each coordinate of x; coordinates with equal labels are always observed or missing together."""
-        return [0] * self.size("x")
+        return range(self.size("x"))
 
     @property
     def exposure(self) -> tuple[str, Sequence[int]] | None:

@@ -155,9 +155,14 @@ class VampModule(Prior):
             data: dictionary from each data variable that the guide reads to its values (K, T, D).
 
         Raises:
-            ValueError: the sequences have fewer steps than the pseudo-sequences.
+            ValueError: the sequences are fewer than the components, or have fewer steps than the pseudo-sequences.
         """
         for name, pseudo in self.pseudo.items():
+            if len(data[name]) < len(pseudo):
+                raise ValueError(
+                    f"this Vamp has {len(pseudo)} components, but only {len(data[name])} sequences of {name} are given "
+                    "to start them; give more sequences, or build the Vamp with fewer components (prior_components)"
+                )
             if data[name].shape[1] < self.steps:
                 raise ValueError(
                     f"the pseudo-sequences of this Vamp have {self.steps} steps, but the given sequences of {name} "

@@ -386,7 +386,12 @@ class Join(nn.Module):
             t: the step, or a slice of N steps.
             live: values (B, D) or (B, N, D) of the parts that were not known in `hoist`, in the order of all parts.
         """
-        first = hoisted.steps[t] if isinstance(t, int) else hoisted.base[:, t]
+        if isinstance(t, int):
+            first = hoisted.steps[t]
+        elif hoisted.rows is None:
+            first = hoisted.base[:, t]
+        else:
+            first = torch.stack([hoisted.steps[s] for s in range(t.start, t.stop)], dim=1)
         if self.first is None:
             known = dict(zip(hoisted.known, first.split([self.sizes[i] for i in hoisted.known], dim=-1), strict=True))
             remaining = iter(live)

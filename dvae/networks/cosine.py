@@ -227,9 +227,9 @@ class Dropout(nn.Dropout):
 
     @override
     def forward(self, input: Tensor) -> Tensor:
-        if not (self.training and 0 < self.p < 1 and input.device.type == "cpu"):
-            return super().forward(input)
         threshold = round((1 - self.p) * 2**16)
+        if not (self.training and 0 < threshold < 2**16 and input.device.type == "cpu"):
+            return super().forward(input)
         words = torch.empty(-(-input.numel() // 4), dtype=torch.int64).random_(-(2**63), None)
         mask = words.view(torch.int16)[: input.numel()].view(input.shape) < threshold - 2**15
         return input * mask.to(input.dtype).mul_(2**16 / threshold)

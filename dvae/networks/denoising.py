@@ -134,7 +134,7 @@ def ragged_cosine_basis(lengths: Tensor, length: int, dtype: torch.dtype) -> Ten
     """Return the orthonormal DCT-II matrix (B, T, T) of the valid steps of each sequence, 0 elsewhere."""
     steps = torch.arange(length, dtype=dtype, device=lengths.device)
     n, k = lengths.to(dtype)[:, None, None], steps[:, None]
-    basis = (math.pi * (steps + 0.5) * k / n).cos() * ((k > 0) + 1.0).sqrt() / n.sqrt()
+    basis = (math.pi * (steps + 0.5) * k / n).cos() * ((k > 0).to(dtype) + 1).sqrt() / n.sqrt()
     return basis * ((k < n) & (steps < n))
 
 

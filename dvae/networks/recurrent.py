@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from typing_extensions import override
 
+from ..factorization.relations import ALL
 from .base import Chain, Hoisted, Input, Join, Network, part, perceptron
 from .cells import GRU, LSTM
 from .extract import Extract, Extractors
@@ -193,7 +194,7 @@ class Memory(nn.Module):
         if self.embed is None:
             value = torch.cat(parts, dim=-1)
         else:
-            value = state.base[:, t : t + count] if state.base.shape[1] > 1 else state.base
+            value = torch.stack([state.steps[s if len(state.steps) > 1 else 0] for s in range(t, t + count)], dim=1)
             for part, (_, _, weight) in zip(parts, state.live, strict=True):
                 value = value + part @ weight
             value = self.embed[1](value)
@@ -305,9 +306,7 @@ class RecurrentNetwork(Network):
                     future.append((parent, max(0 if math.isinf(low) else int(low), 0)))
                     last = -1
                 self.points += [(parent, lag) for lag in range(first, last + 1)]
-        if spec.stack and (
-            not past or {parent for parent, _ in past} != {parent for parent, _ in future} or spec.separate
-        ):
+        if spec.stack and (not past or spec.separate or any(parent.relation != ALL for parent, _ in past + future)):
             raise ValueError(
                 "Recurrent(stack=True) needs separate=False, and every parent with a past or future must be read over "
                 "{1:T}; change these, or use stack=False"

@@ -249,18 +249,25 @@ class LinearSDENetwork(Network):
         transitions = None
         if self.gap in parents:
             transitions = tuple(part.unbind(1) for part in self.equation.at_all(parents[self.gap], lengths, self.gap))
-        return transitions, parents[self.before].unbind(1) if self.before in parents else None
+        return transitions, parents[self.before].unbind(1) if self.before in parents else None, lengths
 
     @override
     def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        transitions, previous = state
-        decay, whitening = self.drawn_over(t, samples) if transitions is None else (part[t] for part in transitions)
+        transitions, previous, lengths = state
+        decay, whitening = (
+            self.drawn_over(t, samples, lengths) if transitions is None else (part[t] for part in transitions)
+        )
         return _features(decay, None, whitening, self._last(previous, t, samples, decay)), state
 
-    def drawn_over(self, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+    def drawn_over(
+        self, t: int, samples: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Return F and the whitening matrix of Q, (B, D, D) each, at step t of a loop that draws the gaps."""
         gaps = samples[self.gap][t]
-        decay, whitening = self.equation.over(gaps, torch.full_like(gaps, t > 0, dtype=torch.bool), self.gap, t)
+        has_previous = torch.full_like(gaps, t > 0, dtype=torch.bool)
+        if lengths is not None:
+            has_previous &= (t < lengths)[:, None]
+        decay, whitening = self.equation.over(gaps, has_previous, self.gap, t)
         return decay[:, 0], whitening[:, 0]
 
     def _last(self, previous: Any, t: int, samples: Mapping[str, Sequence[Tensor]], like: Tensor) -> Tensor:
@@ -274,6 +281,7 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
         super().__init__(inputs, before, spec.gap, spec.times)
         size = before.size
         self.potential = spec.potential.build([p for p in inputs if p is not before], True, size)
+        self.stationary = self.potential.stationary
         self.out = nn.Linear(self.potential.features, size + size**2)
         with torch.no_grad():  # initially, the potential observes every coordinate with unit noise
             self.out.weight[size:] *= 0.1
@@ -287,27 +295,27 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
     def start(self, parents: Mapping[str, Tensor], batch: int, length: int, lengths: Tensor | None = None) -> Any:
         if all(parent.name in parents for parent in self.potential.inputs):
             transitions = tuple(part.unbind(1) for part in self._at_all(parents, length, lengths))
-            return transitions, parents[self.before].unbind(1) if self.before in parents else None, None
+            return transitions, parents[self.before].unbind(1) if self.before in parents else None, lengths, None
         others = {parent.name: parents[parent.name] for parent in self.potential.inputs if parent.name in parents}
         return *super().start(parents, batch, length, lengths), self.potential.start(others, batch, length, lengths)
 
     @override
     def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
-        transitions, previous, potential = state
+        transitions, previous, lengths, potential = state
         if potential is None:
             decay, offset, whitening = (part[t] for part in transitions)
             return _features(decay, offset, whitening, self._last(previous, t, samples, decay)), state
-        decay, whitening = self.drawn_over(t, samples) if transitions is None else (part[t] for part in transitions)
+        decay, whitening = (
+            self.drawn_over(t, samples, lengths) if transitions is None else (part[t] for part in transitions)
+        )
         features, potential = self.potential.step(potential, t, samples)
         last = self._last(previous, t, samples, decay)
-        return _features(*self.updated(decay, whitening, features), last), (transitions, previous, potential)
+        return _features(*self.updated(decay, whitening, features), last), (transitions, previous, lengths, potential)
 
     @override
     def select(self, state: Any, rows: Tensor | None) -> Any:
-        transitions, previous, potential = state
-        return *select((transitions, previous), rows), None if potential is None else self.potential.select(
-            potential, rows
-        )
+        *own, potential = state
+        return *select(tuple(own), rows), None if potential is None else self.potential.select(potential, rows)
 
     def _at_all(
         self, parents: Mapping[str, Tensor], length: int, lengths: Tensor | None

@@ -127,8 +127,8 @@ class PanelWindows:
         if self.n_unobserved:
             parts.append(f"{self.n_unobserved} windows without an observed target in their past or future")
         rest = (self._last - self._low) % self._stride
-        if self.split == "test" and rest.any():
-            parts.append(f"up to {int(rest.max())} steps at the end of {int((rest > 0).sum())} sequences, fewer than a stride")
+        if self.split == "test" and (count := int(rest.count_nonzero())):
+            parts.append(f"up to {int(rest.max())} steps at the end of {count} sequences, fewer than a stride")
         return ", and ".join(parts)
 
     @property

@@ -24,7 +24,7 @@ from ...data.schema import Schema
 from ...distributions import DistributionSpec, FixedNormal
 from ...inference.training.options import Stage, Training
 from ...inference.training.recipe import Recipe
-from ...motion import Heading, Skeleton
+from ...motion import Heading
 from ...motion.data.protocols import Poses
 from ...options import Layers, Size
 from ...program.model import DynamicalVAE
@@ -75,12 +75,6 @@ class DeterministicMethod(PoseMethod, LikelihoodMethod):
         if self.emission is not None:
             return super().distributions()
         return {"p(x)": FixedNormal(scale=sqrt(0.5), residual=self.residual, error_weight=True)}
-
-    @override
-    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
-        preset = super().preset(skeleton)
-        return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
     @override
     def resolve_defaults(self, data: Any) -> Self:

@@ -37,8 +37,9 @@ class ERD(DeterministicMethod):
     Args:
         encoder: widths of the perceptron before the LSTMs; the default depends on the skeleton, as for `width`.
         decoder: widths of the perceptron after the LSTMs; the default depends on the skeleton, as for `width`.
-        noise: final standard deviation of the noise on the input in training, relative to the scale of x. It rises
-            from 0 over a third of training, after the first tenth. 0 for none.
+        noise: final standard deviation of the noise on the input in training, relative to the scale of x, or
+            in the unit of x without `standardise`. It rises from 0 over a third of training, after the first tenth. 0
+            for none.
     """
 
     name = "erd"

@@ -75,7 +75,7 @@ class MoGlow(LikelihoodMethod):
     generative = "p(x_t | x_{<t})"
     inference = ""
     trainings: ClassVar[Mapping[str, Training]] = {
-        "human36m": Training(80_000, 64, 1e-4),  # from the port in TrajeVAE's code
+        "human36m": Training(80_000, 64, 1e-4, gradient_clip=None),  # from the port in TrajeVAE's code
         **LikelihoodMethod.trainings,
     }
 

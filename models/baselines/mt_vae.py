@@ -84,7 +84,7 @@ class MTVAE(FutureMethod):
     inference = "q(w | x_{1:T}, h)"
     presets = PRESETS
     trainings: ClassVar[Mapping[str, Training]] = {
-        **dict.fromkeys(("human36m", "humaneva"), Training(60_000, 256, 1e-4)),
+        **dict.fromkeys(("human36m", "humaneva"), Training(60_000, 256, 1e-4, gradient_clip=None)),
         "": Training(decay=0.5),
     }
 

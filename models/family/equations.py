@@ -66,7 +66,11 @@ class Equations(LatentMethod):
     @override
     def sizes(self) -> dict[str, int]:
         """Return the sizes of all variables; the data override the sizes of observed ones."""
-        sizes = {name: self.latents.get(name, self.latent) for name in self.equations()[0].variables}
+        variables = self.equations()[0].variables
+        if unknown := self.latents.keys() - {*variables}:
+            names = ", ".join(sorted(unknown))
+            raise ValueError(f"latents gives sizes of {names}, but the equations have only {', '.join(variables)}")
+        sizes = {name: self.latents.get(name, self.latent) for name in variables}
         return {**sizes, **{name: Discrete(states) for name, states in self.states.items()}}
 
     @override

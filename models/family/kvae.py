@@ -198,7 +198,7 @@ class Kalman:
 class KalmanNetwork(Network):
     """Network of `Kalman`; the features are location and whitening matrix of the prediction, (..., D + D * D)."""
 
-    distribution = Triangular
+    head = Triangular
     stationary = streams = True
     log_noise: Tensor
     log_emission: Tensor

@@ -28,7 +28,7 @@ from torch.nn import functional
 from typing_extensions import override
 
 from ...data.batch import WHOLE, Batch
-from ...data.sequences import interpolate_missing
+from ...data.sequences import as_source, interpolate_missing
 from ...distributions.base import DistributionSpec
 from ...distributions.triangular import Triangular
 from ...factorization.inversion import guide
@@ -210,7 +210,7 @@ def start_regimes(model: DynamicalVAE, train: Any, smoothing: int, iterations: i
         smoothing: as in `RSLDS`.
         iterations: iterations of expectation maximisation.
     """
-    data = model.read(train.sample(WINDOWS, torch.default_generator))
+    data = model.read(as_source(train).sample(WINDOWS, torch.default_generator))
     path, valid = principal_path(model, data, smoothing)
     moves = functional.pad(path[:, 1:] - path[:, :-1], (0, 0, 1, 0))
     points = torch.cat([path - moves / 2, moves], -1)[valid]

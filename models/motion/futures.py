@@ -63,8 +63,8 @@ class FutureMethod(PoseMethod):
     )
 
     trainings: ClassVar[Mapping[str, Training]] = {
-        HUMAN36M.name: Training(39_063, 64, 1e-3, 0.8),
-        HUMANEVA.name: Training(7813, 64, 1e-3, 0.8),
+        HUMAN36M.name: Training(39_063, 64, 1e-3, 0.8, gradient_clip=None),
+        HUMANEVA.name: Training(7813, 64, 1e-3, 0.8, gradient_clip=None),
         "": Training(learning_rate=3e-3, decay=0.5),
     }
 
@@ -72,12 +72,6 @@ class FutureMethod(PoseMethod):
     beta: Amount | None = None
     join: Amount = 0.0
     heading: bool | None = None
-
-    @override
-    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
-        preset = super().preset(skeleton)
-        return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
     @override
     def distributions(self) -> Mapping[str, DistributionSpec]:

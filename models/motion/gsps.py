@@ -43,6 +43,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from ...data.batch import WHOLE, Batch
+from ...data.schema import Schema
 from ...data.sequences import interpolate_missing
 from ...data.views import History, Parts
 from ...distributions import Delta, Directions
@@ -124,6 +125,13 @@ class GSPS(EnergyMethod):
     limb: Amount = 500.0
     angles: Amount = 100.0
     pose_prior: Amount = 0.01
+
+    @override
+    def training(self, data: Any) -> Training:
+        """Return the default training options for these data, with the published clip for their number of frames."""
+        training, schema = super().training(data), Schema.of(data)
+        is_published = isinstance(schema, Poses) and schema.preset in self.trainings
+        return replace(training, gradient_clip=CLIP / schema.frames) if is_published else training
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -121,6 +121,8 @@ PAPER: dict[str, Any] = {
 }
 PUBLISHED = {skeleton: PRESETS[skeleton] | PAPER | {"samples": 50} for skeleton in ("human36m", "humaneva")}
 """The published model by skeleton (`HiTDVAE.published`); other skeletons have the values of HumanEva-I."""
+KL_STATIC = 0.1
+"""The paper's weight of the KL of w, relative to means over T frames."""
 
 PARTS = ("lower", "upper")
 FRAMES = 15
@@ -285,7 +287,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
         if isinstance(schema, Poses) and (method.loss == "best-of-many" or method.heading):
             self.poses(schema)
             if method.loss == "best-of-many":
-                distribution = replace(model_arguments["distributions"]["p(x)"], fitted="scale")
+                distribution = model_arguments["distributions"]["p(x)"]
+                distribution = replace(distribution, fitted="scale", error_weight=not distribution.learned)
                 model_arguments["distributions"]["p(x)"] = (
                     Directions(residual=method.residual or 0.0) if method.bones else distribution
                 )
@@ -330,6 +333,8 @@ class HiTDVAE(EnergyMethod, LatentMethod):
             preset = self.preset(schema.skeleton)
             shapes = {name: preset[name] for name in ("decoder", "pose_width")}
             return replace(method, heading=bool(self.heading)).with_presets({**self.unset, **shapes})
+        if self.published or schema.preset in PUBLISHED:
+            method = method.with_presets({"kl_static": KL_STATIC * schema.frames})
         return super(HiTDVAE, method).resolve_defaults(schema)
 
     @override

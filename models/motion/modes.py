@@ -72,7 +72,7 @@ class ModesMethod(FutureMethod):
     inference = ""
     trainings: ClassVar[Mapping[str, Training]] = {
         **FutureMethod.trainings,
-        **dict.fromkeys((HUMAN36M.name, HUMANEVA.name), Training(15_625, 32, 1e-4, 0.8)),
+        **dict.fromkeys((HUMAN36M.name, HUMANEVA.name), Training(15_625, 32, 1e-4, 0.8, gradient_clip=None)),
         "": Training(decay=0.5),
     }
 

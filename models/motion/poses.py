@@ -56,8 +56,10 @@ class PoseMethod(Method):
     """Representation that the protocol of the data must have."""
 
     def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the values of options that are None, for poses of this skeleton."""
-        return self.presets.get(skeleton.name, self.presets[""])
+        """Return the values of options that are None, for poses of this skeleton; headings need left and right."""
+        preset = self.presets.get(skeleton.name, self.presets[""])
+        unknown = "heading" in preset and not (skeleton.left and skeleton.right)
+        return {**preset, "heading": False} if unknown else preset
 
     @override
     def resolve_defaults(self, data: Any) -> Self:

@@ -53,7 +53,8 @@ class TrajectoryMethod(PoseMethod):
     Args:
         latent: size of the latent.
         keep: probability that a joint is given, in training.
-        rotate: whether to rotate every training window about the up axis by a uniform angle.
+        rotate: whether to rotate every training window about the up axis by a uniform angle; it has no effect if the
+            protocol has `heading`, which fixes the direction.
         heading: whether to rotate every window so that its first pose faces one way, and rotate the motion back. The
             model is then exactly equivariant to rotations, and `rotate` has no effect. By default off for Human3.6M, as
             in the paper, where the network learns this from rotated windows, and on for other skeletons with known left
@@ -66,12 +67,6 @@ class TrajectoryMethod(PoseMethod):
     keep: Share = 0.15
     rotate: bool = True
     heading: bool | None = None
-
-    @override
-    def preset(self, skeleton: Skeleton) -> Mapping[str, Any]:
-        """Return the preset of the skeleton; if its left and right are unknown, `heading` is off."""
-        preset = super().preset(skeleton)
-        return preset if skeleton.left and skeleton.right else {**preset, "heading": False}
 
     def extra_inputs(self) -> View:
         """Return the view (see `dvae.data.views`) that adds joint trajectories and the first pose to each window."""
@@ -120,7 +115,8 @@ class TrajectoryMethod(PoseMethod):
     @override
     def train(self, train: Windows, validation: Windows | None = None, steps: int = 2000) -> Recipe:
         """Return one stage that maximises the bound, on windows with random rotations and given paths."""
-        windows = train.with_protocol(replace(train.protocol, rotate=self.rotate))
+        rotate = self.rotate and not train.protocol.heading
+        windows = train.with_protocol(replace(train.protocol, rotate=rotate))
         return Recipe(windows.given(self.keep), validation and validation.given(self.keep), [Stage(steps)])
 
 
@@ -135,7 +131,10 @@ class LatentTrajectoryMethod(TrajectoryMethod):
 
     trainings: ClassVar[Mapping[str, Training]] = {
         HUMAN36M.name: Training(
-            240_000, 64, Piecewise(((0, 1e-4), (79_999, 1e-4), (80_000, 2.5e-5), (159_999, 2.5e-5), (160_000, 6.25e-6)))
+            240_000,
+            64,
+            Piecewise(((0, 1e-4), (79_999, 1e-4), (80_000, 2.5e-5), (159_999, 2.5e-5), (160_000, 6.25e-6))),
+            gradient_clip=None,
         ),
         "": Training(24_000, 16, 5e-4, 0.8),
     }

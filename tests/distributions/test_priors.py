@@ -111,6 +111,14 @@ OPTIONS = {
 VAMP = {**OPTIONS, "prior": "vamp", "prior_components": 3, "prior_steps": 6, "heading": False, "pose_prior": 0.0}
 
 
+def test_pseudo_sequences_need_as_many_sequences():
+    head = build("vamp", 2).generator["w"].head
+    with pytest.raises(ValueError, match="has 3 components, but only 2 sequences of x are given"):
+        head.start_at({"x": torch.randn(2, 4, 2)})
+    with pytest.raises(ValueError, match="have 4 steps, but the given sequences of x have only 3"):
+        head.start_at({"x": torch.randn(3, 3, 2)})
+
+
 def weights(run: Path):
     return (run / "last.safetensors").read_bytes()
 

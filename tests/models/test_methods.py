@@ -18,6 +18,7 @@ from dvae.models import registry
 from dvae.models.family.dkf import Gated, GatedNormal
 from dvae.models.method import LatentMethod
 from dvae.models.registry import configured
+from dvae.motion.data.protocols import Poses
 from dvae.testing import FactorizationContract
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -270,11 +271,44 @@ def test_a_method_trains_with_an_option_or_raises_the_expected_error(name, optio
             {"generative": "p(v) p(w) p(x_t | w, v)", "inference": "q(v | x_{1:T}) q(w | x_{1:T}, v)", "prior": "vamp"},
             "nothing else",
         ),
+        ("equations", {"latents": {"z": 2, "u": 3}}, "latents gives sizes of u, but the equations have only z, x"),
     ],
 )
 def test_invalid_options_are_an_error(name, options, message):
     with pytest.raises(ValueError, match=message):
         dvae.method(name, **options).build({"x": 3})
+
+
+def test_hidden_entries_are_single_columns_of_arrays_and_whole_steps_of_a_diffusion():
+    x, generator = torch.randn(200, 10, 3), torch.Generator().manual_seed(0)
+    keep = 0.5**0.5  # of steps, and of entries, independently
+    for emission, partial in ((None, keep * (1 - keep**3 - (1 - keep) ** 3)), ("diffusion", 0.0)):
+        mask = dvae.method("dkf", hide=0.5, emission=emission).train(x, steps=2).batches.sample(200, generator)["mask"]
+        assert mask.double().mean().item() == pytest.approx(0.5, abs=0.04)
+        is_partial = mask.any(-1) & ~mask.all(-1)
+        assert is_partial.double().mean().item() == pytest.approx(partial, abs=0.04)
+
+
+@pytest.mark.parametrize("name", ["equations", "rslds"])
+def test_recipes_of_arrays_are_prepared_like_those_of_windows(name):
+    prior = {"prior": "vamp", "prior_components": 3, "prior_steps": 4}
+    equations = {"generative": "p(w) p(x_t | w)", "inference": "q(w | x_{1:T})"}
+    options = {"rslds": {}, "equations": equations | prior}[name]
+    method = small(name, hide=0.2, warm_up=1, **options)
+    x = torch.randn(4, 6, 3)
+    model = method.build({"x": 3})
+    dvae.fit(model, method.train(x, steps=2), batch_size=2, accelerator="cpu", progress=False)
+    assert torch.isfinite(torch.cat([parameter.flatten() for parameter in model.parameters()])).all()
+
+
+def test_scheduled_sampling_does_not_apply_to_models_that_read_no_data():
+    """The discrete states of a switching model are no data."""
+    feeding = {
+        name: dvae.method(name, scheduled_sampling=1.0).train(torch.zeros(2, 3, 1), steps=10).feeding
+        for name in ("dkf", "rslds", "srnn")
+    }
+    assert feeding["dkf"] == feeding["rslds"] == 0.0
+    assert feeding["srnn"] != 0.0
 
 
 # ----------------------------------------------------------------------------- the family's published networks
@@ -458,6 +492,20 @@ def test_entry_points_add_methods_but_cannot_replace_one(monkeypatch):
             dvae.methods()
     finally:
         dvae.methods.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["gsps", "bom-parts", "hit-dvae", "cvae", "aclstm"])
+def test_poses_without_known_sides_have_no_heading(name):
+    skeleton = motion.Skeleton(("root", "a", "b", "c", "d"), (-1, 0, 1, 0, 3), name="unnamed")
+    poses = Poses.from_data(motion.PROTOCOLS["simulated"], skeleton)
+    assert dvae.method(name).resolve_defaults(poses).heading is False
+
+
+@pytest.mark.parametrize("name", ["trajevae", "cvae-rnn", "moglow", "mt-vae", "cvae", "dlow"])
+def test_published_trainings_without_clipping_have_none(name):
+    """Sources: the public code of TrajeVAE, MT-VAE and DLow."""
+    poses = Poses.from_data(motion.PROTOCOLS["h36m"], motion.HUMAN36M)
+    assert dvae.method(name).training(poses).gradient_clip is None
 
 
 # ------------------------------------------------------------------------------------------ diffusion of all steps

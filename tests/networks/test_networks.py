@@ -291,6 +291,29 @@ def test_single_steps_equal_all_steps_at_once(kind, direction):
                 torch.testing.assert_close(stepwise * is_step, together * is_step, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("kind", ["dense", "gru", "lstm, two layers, embedded"])
+def test_chunks_after_a_selection_equal_steps(kind):
+    """A chunk of several steps starts at selected rows; `x` is known and `z` is drawn."""
+    inputs = [Input("z", 2, Relation.parse("t-1")), Input("x", 3, Relation.parse("t"))]
+    if kind != "dense":
+        inputs = [Input("z", 2, Relation.parse("<t")), Input("x", 3, Relation.parse("<=t"))]
+    network, rows = build(kind, inputs), torch.tensor([2, 0, 1])
+    parents = draw(inputs, 3)
+    expected = network(parents, T)[rows]
+    state = network.select(network.start({"x": parents["x"]}, 3, T), rows)
+    draws = {"z": list(parents["z"][rows].unbind(1))}
+    chunk, _ = network.forward_chunk(state, 0, T, draws)
+    torch.testing.assert_close(chunk, expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("pair", [("<t", ">t"), ("<=t-2", ">t"), ("<=t-3", ">=t")])
+def test_a_stack_refuses_parents_that_skip_steps(pair):
+    """The backward memory reads forward states, which contain the skipped steps."""
+    first, second = map(Relation.parse, pair)
+    with pytest.raises(ValueError, match=r"every parent with a past or future must be read over \{1:T\}"):
+        Recurrent(4, stack=True).build([Input("x", 2, first | second)], True, 2)
+
+
 # ---------------------------------------------------------------------------------------------------- padding
 
 

@@ -13,7 +13,7 @@ from torch.distributions import MultivariateNormal
 
 from dvae import DynamicalVAE, distributions
 from dvae.factorization.relations import Relation
-from dvae.networks import Dense, Input, LinearSDE, LinearSDEGuide, Recurrent
+from dvae.networks import Dense, Input, Linear, LinearSDE, LinearSDEGuide, Recurrent
 from dvae.networks.base import share_modules
 from dvae.networks.sde import transition
 from dvae.testing import FactorizationContract
@@ -218,3 +218,34 @@ def test_single_steps_of_the_guide_equal_all_steps_at_once(given_names):
             selected, t, {name: [v[rows] for v in value] for name, value in draws.items()}
         )
         torch.testing.assert_close(selected_features, features[rows])
+
+
+def test_gaps_that_a_loop_draws_may_be_ragged():
+    """The gaps of padding are 0, and no transition reads them."""
+    sde, lengths, rows = guide(), torch.tensor([6, 1, 3, 4]), torch.tensor([2, 2, 0])
+    is_step = (torch.arange(6) < lengths[:, None])[..., None]
+    values = {name: double(4, 6, parent.size) for name, parent in zip("zxyd", sde.inputs, strict=True)}
+    values = {name: (value.exp() if name == "d" else value) * is_step for name, value in values.items()}
+    expected, state = sde(values, 6, lengths), sde.start({"x": values["x"]}, 4, 6, lengths)
+    selected, draws = sde.select(state, rows), {name: values[name].unbind(1) for name in "zyd"}
+    for t in range(6):
+        features, state = sde.step(state, t, draws)
+        chosen, selected = sde.step(selected, t, {name: [v[rows] for v in value] for name, value in draws.items()})
+        torch.testing.assert_close(features * is_step[:, t], expected[:, t] * is_step[:, t], rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(chosen, features[rows])
+
+
+def test_a_potential_that_depends_on_the_step_number_is_not_streamed():
+    pair = "p(z_t | z_{t-1}, d_t) p(x_t | z_t)", "q(z_t | z_{t-1}, x_t, d_t)"
+    potentials = {"dense": Dense((4,)), "linear": Linear(4)}
+    models = {
+        name: DynamicalVAE(
+            *pair, {"z": 2, "x": 3, "d": 1}, {"p(z)": LinearSDE(), "q(z)": LinearSDEGuide(potential=potential)},
+            dict.fromkeys(("p(z)", "q(z)"), distributions.Triangular()),
+        )
+        for name, potential in potentials.items()
+    }  # fmt: skip
+    batch = {"x": torch.randn(2, 9, 3), "d": torch.rand(2, 9, 1) + 0.1}
+    assert models["dense"].filter(batch, particles=10).filtered.log_evidence.isfinite().all()
+    with pytest.raises(ValueError, match="9 steps"):
+        models["linear"].filter(batch, particles=10)

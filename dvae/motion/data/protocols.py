@@ -253,6 +253,12 @@ class Poses(Schema):
 
     @property
     @override
+    def together(self) -> Sequence[int]:
+        """Label of the joint of each coordinate of a window; models that do not read positions need all joints."""
+        return [n // 3 for n in range(self.windows.size("x"))]
+
+    @property
+    @override
     def windows(self) -> Poses:
         root: RootMotion = "drop" if self.protocol.root == "drop" else "relative"
         protocol = replace(self.protocol, representation="positions", root=root)

@@ -245,6 +245,7 @@ def test_phases_train_the_matrices_and_then_their_weights():
         (lambda: KVAE(auxiliary=0), "auxiliary"),
         (lambda: smooth(dvae.method("vae").build({"x": 2}), torch.zeros(1, 2, 2)), "needs"),
         (lambda: Triangular().build(Shape(2, 5)), "Triangular"),
+        (lambda: dvae.method("kvae").build({"x": 2}).with_prior({"p(a)": dvae.distributions.Normal()}), "Triangular"),
     ],
 )
 def test_wrong_arguments_are_an_error(run, message):

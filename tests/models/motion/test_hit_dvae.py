@@ -244,7 +244,22 @@ def test_the_published_model_is_fitted_and_forecasts(people, tmp_path):
     run = runs.load(tmp_path / "run")
     assert run.method == method.resolve_defaults(data.windows("train"))
     past = data.windows("test").all()["x"][:2, :15]
-    assert torch.isfinite(run.model.forecast(past, 80, 2)["x"]).all()
+    torch.manual_seed(0)
+    forecasts = run.model.forecast(past, 80, 2)["x"]
+    assert torch.isfinite(forecasts).all()
+    torch.manual_seed(0)  # the unit scale weights the error: forecasts are means without a noise of a metre
+    assert torch.equal(forecasts, run.model.forecast(past, 80, 2, draw_emission=False)["x"])
+    assert not run.model.is_drawn()
+    assert dvae.method("hit-dvae", **small_networks).build(data.windows("train")).is_drawn()  # the scale is fitted
+
+
+@pytest.mark.parametrize("length", [50, 125])
+def test_the_weight_of_the_static_latent_is_relative_to_the_number_of_frames(length):
+    schema = Poses.from_data(motion.PROTOCOLS["h36m"], motion.HUMAN36M, length)
+    for options in ({}, {"published": True}):
+        method = replace(dvae.method("hit-dvae", **options).resolve_defaults(schema), warm_up=0)
+        assert method.objective().kl_weight["w"] == pytest.approx(0.1 * length)
+    assert dvae.method("hit-dvae", kl_static=2.0).resolve_defaults(schema).kl_static == 2.0
 
 
 def test_schedules_have_the_epochs_of_the_paper(windows):
