@@ -343,7 +343,8 @@ def _earlier_outcome(run: _Run) -> Outcome | None:
         others = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
         raise ValueError(
             f"{run.path} contains a run with other options: its {name} is {stored.get(name)!r}, the sweep's "
-            f"{expected.get(name)!r}{others}; use the same options, or another directory"
+            f"{expected.get(name)!r}{others}; use the same options or another directory, or delete this run to fit it "
+            "again"
         )
     return _outcome(run, _stored_fit(run)) if state["status"] in ENDED else None
 
@@ -361,7 +362,7 @@ def _stored_fit(run: _Run) -> Fit:
 
 def _options(method: Trainable, schema: Schema, training: Training, fingerprint: str) -> dict[str, Any]:
     """Return the options that define a run on any machine; scheduled sampling follows from the method."""
-    excluded = ("scheduled_sampling", "progress", "accelerator")
+    excluded = ("scheduled_sampling", "progress", "accelerator", "log_every")
     options = {name: value for name, value in vars(training).items() if name not in excluded}
     return {**method.config(), **options, **dict(flat(schema.config(), "data's ")), "data's fingerprint": fingerprint}
 

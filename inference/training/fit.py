@@ -364,8 +364,9 @@ def _fit(
         observed_steps(model, windows)  # raises now rather than at the first validation
         held_out, observed = windows, None
     # Hashing all data takes time, and only stored runs need it.
-    fingerprint = train.fingerprint if out is not None and isinstance(train, Fingerprinted) else None
-    record = {"training_data": fingerprint} if isinstance(fingerprint, str) else {}
+    parts = {} if out is None else {"training_data": train, "validation_data": windows}
+    prints = {name: part.fingerprint for name, part in parts.items() if isinstance(part, Fingerprinted)}
+    record = {name: fingerprint for name, fingerprint in prints.items() if isinstance(fingerprint, str)}
     run = run_directory(out, resume, record)
     record |= recorded(training, svi.plan)
     with ExitStack() as stack:
@@ -375,9 +376,15 @@ def _fit(
             warnings.warn(advice, stacklevel=3)
         if run is not None and first:
             stack.enter_context(run.locked())
+            run_directory(out, resume, {})  # another process may have written a run since the first check
         processes.wait(svi.fabric)  # every process must look for an earlier run before the first one writes
         if run is not None and resume:
             restore(svi, run)
+            if held_out is None and state.best_step is not None:
+                raise ValueError(
+                    f"{run.path} selects its weights on validation data; pass these data to resume it, or start a new "
+                    "run in another directory"
+                )
             processes.wait(svi.fabric)  # every process must read the checkpoint before the first one writes
         history, receivers = InMemory(), list[Tracker]()
         if first:
@@ -426,7 +433,7 @@ def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapp
     Args:
         out: path of the directory; None for no directory.
         resume: whether to continue the run in the directory.
-        record: description of the run, for `config.json`, with the fingerprint of its training data.
+        record: description of the run, for `config.json`, with the fingerprints of its data.
 
     Raises:
         CheckpointError: when `out` contains a run although `resume` is False, no run although it is True, or a run on
@@ -442,12 +449,14 @@ def run_directory(out: str | os.PathLike[str] | None, resume: bool, record: Mapp
         raise CheckpointError(
             f"{out} already holds a run; continue it with resume=True{lower}, or choose another directory"
         )
-    before, now = run.config.get("training_data"), record.get("training_data")
-    if before is not None and now is not None and before != now:
-        raise CheckpointError(
-            f"{run.path} was fitted on other training data: {CONFIG} has the fingerprint {str(before)[:12]}…, these "
-            f"data have {now[:12]}…; resume with the same data, or start a new run in another directory"
-        )
+    for name in ("training_data", "validation_data"):
+        before, now = run.config.get(name), record.get(name)
+        if before is not None and now is not None and before != now:
+            raise CheckpointError(
+                f"{run.path} was fitted on other {name.replace('_', ' ')}: {CONFIG} has the fingerprint "
+                f"{str(before)[:12]}…, these data have {now[:12]}…; resume with the same data, or start a new run in "
+                "another directory"
+            )
     return run
 
 

@@ -464,9 +464,9 @@ class SVI:
         score = -row[NAME] if by_forecast else -row[f"{prefix}loss"] if by_loss else row[f"{prefix}bound"]
         if not prefix or self.rates(state.step - 1)["scheduled_sampling"] == self.final_feeding:
             state.waited += 1
-            if by_loss and state.best_step is not None and not self._same_objective(state.best_step, state.step):
-                state.best_bound = None  # the best loss so far is of another objective
-            if score > (-math.inf if state.best_bound is None else state.best_bound):  # never true of NaN
+            if state.best_step is not None and not self._are_comparable(state.best_step, state.step, by_loss):
+                state.best_bound = None
+            if math.isfinite(score) and (state.best_bound is None or score > state.best_bound):
                 state.best_step, state.best_bound, state.waited = state.step, score, 0
                 state.best = weights(self.model)
         return {f"validation/{name}": value for name, value in row.items()}
@@ -483,10 +483,16 @@ class SVI:
             score = math.inf  # forecasts may diverge although the bound, given the true past, is finite
         return float(self.total(torch.tensor(score, dtype=torch.float64))) / self.fabric.world_size
 
-    def _same_objective(self, first: int, second: int) -> bool:
-        """Return whether two steps have the same objective."""
+    def _are_comparable(self, first: int, second: int, by_loss: bool) -> bool:
+        """Return whether the scores after two steps are comparable: bounds, or losses of the same objective.
+
+        Args:
+            first: the earlier step.
+            second: the later step.
+            by_loss: whether the score after the later step is a loss.
+        """
         before, now = (stage_at(self.plan, step)[1].objective for step in (first, second))
-        return before is now or before == now
+        return before is now or before == now or not (by_loss or _selects_by_loss(before))
 
     def rates(self, step: int) -> dict[str, float]:
         """Return learning rate, probability of scheduled sampling and, if any, curriculum at a global step.
@@ -583,7 +589,7 @@ class SVI:
         def sums(batch: Batch) -> dict[str, Tensor]:
             terms, _ = self._terms(batch, objective, location, feeding)
             values = _sums(terms)
-            if not terms.likelihood or (isinstance(objective, RequiresDraws) and objective.select == "loss"):
+            if not terms.likelihood or _selects_by_loss(objective):
                 # the last weights of the schedules, so that losses can be compared
                 values["loss"] = objective(terms, self.training.steps).double() * values["steps"]
             return values
@@ -629,6 +635,10 @@ class SVI:
             if not _is_from_distribution(error):
                 raise
             raise NonFiniteError(f"{location}: {error_message(error).partition(chr(10))[0]}") from error
+
+
+def _selects_by_loss(objective: object) -> bool:
+    return isinstance(objective, RequiresDraws) and objective.select == "loss"
 
 
 def _is_weighted(objective: object) -> bool:

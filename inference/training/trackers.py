@@ -215,16 +215,16 @@ class Terminal:
             self._bar.start()
 
     def log(self, step: int, row: Mapping[str, float]) -> None:
-        """Show a row."""
+        """Show a row; a line shows all rows of its step."""
+        if self._bar is None and self._latest and self._next_line <= self._step < step:
+            self._next_line = self._step + self.steps / 10
+            self._print()
         self._step = step
         self._latest |= row
         if self._bar is not None:
             speed = self._bar.tasks[0].speed
             rate = f"{speed:.1f} it/s" if speed else ""
             self._bar.update(self._task, completed=step, terms=self._text(), rate=rate)
-        elif step >= self._next_line and step < self.steps:
-            self._next_line = step + self.steps / 10
-            self._print()
 
     def close(self) -> None:
         """Stop the bar, which stays on the screen, or print the last line."""

@@ -28,7 +28,7 @@ from dvae.inference.training.fit import Interrupted, fit
 from dvae.inference.training.objectives import Evidence
 from dvae.inference.training.options import Stage
 from dvae.inference.training.schedules import Piecewise, Ramp, from_config
-from dvae.inference.training.svi import NonFiniteError
+from dvae.inference.training.svi import SVI, NonFiniteError
 from dvae.inference.training.trackers import InMemory, JSONLines, TensorBoard, Terminal
 from dvae.program.model import DynamicalVAE
 
@@ -140,6 +140,23 @@ def test_runs_with_the_same_seed_are_equal():
         run(model, seed=seed, steps=10)
     assert same(weights(first), weights(second))
     assert not same(weights(first), weights(third))
+
+
+def test_a_loss_and_a_bound_are_not_compared():
+    """The bound of the second stage is far below the loss of the first, with its small weights."""
+    by_loss = Evidence(likelihood_weight=1e-3, kl_weight=0.0, select="loss")
+    result = run(validation=HELD_OUT, stages=[Stage(40, by_loss), Stage(40, Evidence())])
+    steps, bounds = result.series("validation/bound")
+    later = {step: bound for step, bound in zip(steps, bounds, strict=True) if step >= 40}
+    assert (result.best_bound, result.best_step) == (max(later.values()), max(later, key=later.get))
+
+
+def test_an_infinite_bound_does_not_select_weights(tmp_path, monkeypatch):
+    evaluate, values = SVI.evaluate, [1.0, math.inf, 2.0]
+    monkeypatch.setattr(SVI, "evaluate", lambda self, data: {**evaluate(self, data), "bound": values.pop(0)})
+    result = run(validation=HELD_OUT, out=tmp_path)
+    assert (result.best_bound, result.best_step) == (2.0, 60)
+    assert Run(tmp_path).state["best_bound"] == 2.0
 
 
 def test_the_model_ends_in_evaluation_mode_with_the_best_weights_and_best_is_a_copy(tmp_path):
@@ -266,16 +283,40 @@ def test_an_interrupted_run_resumes_bit_for_bit(tmp_path, kind):
         assert same(load_file(tmp_path / "whole" / name), load_file(tmp_path / "parts" / name))
 
 
-def test_resuming_on_other_training_data_is_an_error(tmp_path):
+def test_resuming_on_other_data_is_an_error(tmp_path):
     class Windows(Sequences):
         @property
         def fingerprint(self):
             return f"{self.batch['x'].sum():.6f}"
 
-    run(train=Windows({"x": TRAIN}), out=tmp_path, steps=5)
-    with pytest.raises(CheckpointError, match="fingerprint"):
-        run(train=Windows({"x": TRAIN + 1}), out=tmp_path, steps=10, resume=True)
-    assert run(train=Windows({"x": TRAIN}), out=tmp_path, steps=10, resume=True).step == 10
+    train, held_out = Windows({"x": TRAIN}), Windows({"x": HELD_OUT})
+    other_train, other_held_out = Windows({"x": TRAIN + 1}), Windows({"x": HELD_OUT + 1})
+    run(train=train, validation=held_out, out=tmp_path, steps=5)
+    for parts, message in (
+        ((other_train, held_out), "was fitted on other training data: .* fingerprint"),
+        ((train, other_held_out), "was fitted on other validation data: .* fingerprint"),
+    ):
+        with pytest.raises(CheckpointError, match=message):
+            run(None, *parts, out=tmp_path, steps=10, resume=True)
+    with pytest.raises(ValueError, match="selects its weights on validation data; pass these data"):
+        run(train=train, out=tmp_path, steps=10, resume=True)
+    assert run(train=train, validation=held_out, out=tmp_path, steps=10, resume=True).step == 10
+
+
+def test_a_run_that_another_process_wrote_in_the_meantime_is_not_overwritten(tmp_path, monkeypatch):
+    """The other process writes between the first check of the directory and the lock."""
+    init, other = SVI.init, []
+
+    def slow(self):
+        if not other:
+            other.append(None)
+            run(out=tmp_path / "run", steps=30)
+        return init(self)
+
+    monkeypatch.setattr(SVI, "init", slow)
+    with pytest.raises(CheckpointError, match="already holds a run"):
+        run(out=tmp_path / "run", steps=10)
+    assert Run(tmp_path / "run").state["step"] == 30
 
 
 def test_rows_after_the_checkpoint_are_dropped_on_resume(tmp_path):
@@ -540,8 +581,14 @@ def test_a_line_of_progress_shows_validation_scores_only_when_they_are_new():
     terminal = Terminal(30, Console(file=screen, width=200, no_color=True))
     terminal.start(0)
     for step in range(1, 31):
-        terminal.log(step, {"bound": 1.0, **({"validation/bound": 2.0} if step in (3, 30) else {})})
+        terminal.log(step, {"bound": float(step)})
+        if step in (2, 6, 30):
+            terminal.log(step, {"validation/bound": step + 0.5})
     terminal.close()
     lines = screen.getvalue().splitlines()
-    assert [line for line in lines if "validation" in line] == [lines[0], lines[-1]]
+    assert [line for line in lines if "validation" in line] == [lines[0], lines[1], lines[-1]]
+    assert lines[:2] == [  # a line has all rows of its step
+        "step 3/30  bound 3.000  validation bound 2.500",
+        "step 6/30  bound 6.000  validation bound 6.500",
+    ]
     assert len(lines) == 10
