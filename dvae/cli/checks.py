@@ -156,6 +156,7 @@ def posterior(
     path = out or run / f"{loading.record('posterior', loaded, data_set)}.json"
     stein = stein_discrepancy(loaded.model, selected, draws=stein_draws, seed=seed)
     _add(document, "stein", stein, path, figure, "stein")
+    ERROR.print(f"drawing from the posterior of {len(indices)} windows by NUTS, which can take minutes for each")
     reference = reference_posterior(loaded.model, selected, draws=draws, chains=chains, warmup=warmup, seed=seed)
     _add(document, "posterior", reference, path, figure, "posterior")
 

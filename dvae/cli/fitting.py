@@ -339,9 +339,9 @@ def sweep(
             f"{len(failed)} of {len(results)} runs failed; the same command retries them\n"
             + "\n".join(map(str, failed))
         )
-    then = f"score them with: dvae evaluate {out}/*"
+    then = f"score them with: dvae evaluate {runs.in_command(out)}/*"
     if fitted[0].fitted_on == "windows":
-        then += f"; if all have a bound, compare them with: dvae compare {out}/*"
+        then += f"; if all have a bound, compare them with: dvae compare {runs.in_command(out)}/*"
     OUT.print(f"all {len(results)} runs have ended; {then}", soft_wrap=True)
 
 
@@ -360,7 +360,8 @@ def _resume_hint() -> Iterator[None]:
     except Interrupted as stop:
         if stop.fit.run is None:  # a fit of a part, such as a pose prior, stores no run
             raise
-        stop.args = (f"interrupted after step {stop.fit.step}; resume with: dvae resume {stop.fit.run}",)
+        command = f"dvae resume {runs.in_command(stop.fit.run)}"
+        stop.args = (f"interrupted after step {stop.fit.step}; resume with: {command}",)
         raise
 
 
@@ -389,17 +390,18 @@ def _report(result: Fit) -> None:
 
 
 def _compare(run: Path) -> str:
-    return f"the model has no forecasts; compare its bound with: dvae compare {run} --no-forecasts"
+    return f"the model has no forecasts; compare its bound with: dvae compare {runs.in_command(run)} --no-forecasts"
 
 
-def _use(name: str, run: Path) -> str:
+def _use(name: str, path: Path) -> str:
     """Return the commands to use next with a fitted run."""
+    run = runs.in_command(path)
     if name in metric_models():
         target = "the poses of forecasts" if name == "pose-prior" else "forecasts"
         option = "--pose-prior" if name == "pose-prior" else "--classifier"
         return f"score {target} with: dvae evaluate RUN {option} {run}"
     advice = f"score it with: dvae evaluate {run}"
-    if Run(run).config["data"].get("kind") == "panel":
+    if Run(path).config["data"].get("kind") == "panel":
         command = f"dvae forecast {run} --out FILE.csv --figure FILE.png"
         return f"{advice}\nforecast its test windows with: {command}\nand the future with: {command} --beyond"
     if methods()[name].fitted_on == "segments":

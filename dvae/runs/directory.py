@@ -8,6 +8,7 @@ A relative path stays relative, so a project folder can be moved.
 from __future__ import annotations
 
 import os
+import shlex
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -130,6 +131,12 @@ class Loaded:
         return other
 
 
+def in_command(path: str | os.PathLike[str]) -> str:
+    """Return a path as it is written in a command, quoted if necessary."""
+    text = os.fspath(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
+
+
 def advice(path: str | os.PathLike[str]) -> str:
     """Return advice on how to continue a run.
 
@@ -137,10 +144,10 @@ def advice(path: str | os.PathLike[str]) -> str:
     """
     run = Run(path)
     if run.state["status"] != "failed":
-        return f"continue it with: dvae resume {path}"
+        return f"continue it with: dvae resume {in_command(path)}"
     rate = run.config.get("training", {}).get("learning_rate")
     lower = f"{rate / 10:g}" if isinstance(rate, int | float) else "RATE"
-    return f"continue it at a lower learning rate with: dvae resume {path} --learning-rate {lower}"
+    return f"continue it at a lower learning rate with: dvae resume {in_command(path)} --learning-rate {lower}"
 
 
 def training_of(method: Trainable, data: Dataset, training: Training | Mapping[str, Any] | None) -> Training:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ...data.batch import Batch
+from ...data.batch import WHOLE, Batch
 from ...data.sequences import HeldOutWindows, axis_names, cluster_keys, held_out_windows
 from ...locking import seeded
 from ...program.conditional import evaluating
@@ -146,6 +146,11 @@ def require_readable(name: str, model: Any, batch: Batch) -> None:
         batch: the sequences; only the first is read.
     """
     if isinstance(model, DynamicalVAE):
+        if WHOLE not in (*model.observed, *model.view.names) and WHOLE in batch:
+            raise ValueError(
+                f"{name} has no data variable x, as windows have, but {', '.join(model.observed)}; pass a batch of these "
+                "to dvae.compare, which compares bounds, and score their forecasts by your own code"
+            )
         try:
             with seeded_evaluation(model, 0):
                 model.rollout(on_device_of(model, batch.rows(slice(0, 1))), guide=True)

@@ -703,3 +703,8 @@ def test_prediction_bands_are_calibrated_on_validation_windows_or_labelled_clips
     ):
         assert main(["check", "coverage", str(run), "--samples", "4", *arguments])
         assert message in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(("path", "text"), [("runs/a", "runs/a"), ("ru n", "'ru n'"), ("-r", "./-r")])
+def test_paths_in_commands_are_quoted(path, text):
+    assert runs.in_command(Path(path)) == text

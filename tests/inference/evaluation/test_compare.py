@@ -403,6 +403,18 @@ def test_densities_given_a_past_are_not_compared_with_densities_of_all_steps():
         run(models, ArrayWindows(torch.randn(8, 6, 2), 4))
 
 
+def test_models_of_several_variables_are_compared_by_bounds():
+    pair = "p(z_t | z_{t-1}) p(n_t | z_t) p(y_t | n_t, z_t)", "q(z_t | z_{t-1}, n_{t:T}, y_{t:T})"
+    model = DynamicalVAE(*pair, {"z": 1, "n": 1, "y": 1}, observed=("n", "y"))
+    batch = {"n": torch.randn(8, 6, 1), "y": torch.randn(8, 6, 1)}
+    assert run({"two": model}, batch).ranking == ["two"]
+    for score in (run, evaluate):
+        with pytest.raises(ValueError, match="two has no data variable x, as windows have, but n, y; pass a batch"):
+            score({"two": model}, ArrayWindows(batch["y"], 4))
+    with pytest.raises(TypeError, match="one array x .* but this is a batch of n, y; pass it as it is to dvae.fit"):
+        ArrayWindows(batch, 4)
+
+
 def test_a_model_of_other_columns_is_named():
     models = {"narrow": DynamicalVAE(*DKF, {"z": 1, "x": 2}), "wide": DynamicalVAE(*DKF, {"z": 1, "x": 3})}
     windows = ArrayWindows(torch.randn(8, 6, 2), 4)
