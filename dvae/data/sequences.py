@@ -528,9 +528,10 @@ class ArrayWindows:
 
     def __post_init__(self) -> None:
         if isinstance(self.x, Mapping):
+            names = ", ".join(map(str, self.x))
             raise TypeError(
-                f"windows have one array x (N, T, D), but this is a batch of {', '.join(map(str, self.x))}; pass it as it "
-                "is to dvae.fit and dvae.compare, which compares bounds"
+                f"windows have one array x (N, T, D), but this is a batch of {names}; pass it as it is to dvae.fit and "
+                "dvae.compare, which compares bounds"
             )
         check_real(self.x, "x")
         require(Count, observed=self.observed)

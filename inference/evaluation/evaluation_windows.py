@@ -147,9 +147,10 @@ def require_readable(name: str, model: Any, batch: Batch) -> None:
     """
     if isinstance(model, DynamicalVAE):
         if WHOLE not in (*model.observed, *model.view.names) and WHOLE in batch:
+            own = ", ".join(model.observed)
             raise ValueError(
-                f"{name} has no data variable x, as windows have, but {', '.join(model.observed)}; pass a batch of these "
-                "to dvae.compare, which compares bounds, and score their forecasts by your own code"
+                f"{name} has no data variable x, as windows have, but {own}; pass a batch of these to dvae.compare, "
+                "which compares bounds, and score their forecasts by your own code"
             )
         try:
             with seeded_evaluation(model, 0):

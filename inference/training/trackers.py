@@ -201,6 +201,7 @@ class Terminal:
         self.steps = steps
         self.console = console or PlainConsole(stderr=True)
         self._latest: dict[str, float] = {}
+        self._step = 0
         self._bar: Progress | None = None
 
     def start(self, step: int) -> None:

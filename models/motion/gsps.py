@@ -130,8 +130,9 @@ class GSPS(EnergyMethod):
     def training(self, data: Any) -> Training:
         """Return the default training options for these data, with the published clip for their number of frames."""
         training, schema = super().training(data), Schema.of(data)
-        is_published = isinstance(schema, Poses) and schema.preset in self.trainings
-        return replace(training, gradient_clip=CLIP / schema.frames) if is_published else training
+        if isinstance(schema, Poses) and schema.preset in PUBLISHED["code"]:
+            return replace(training, gradient_clip=CLIP / schema.frames)
+        return training
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -411,7 +411,7 @@ def test_models_of_several_variables_are_compared_by_bounds():
     for score in (run, evaluate):
         with pytest.raises(ValueError, match="two has no data variable x, as windows have, but n, y; pass a batch"):
             score({"two": model}, ArrayWindows(batch["y"], 4))
-    with pytest.raises(TypeError, match="one array x .* but this is a batch of n, y; pass it as it is to dvae.fit"):
+    with pytest.raises(TypeError, match=r"one array x .* but this is a batch of n, y; pass it as it is to dvae.fit"):
         ArrayWindows(batch, 4)
 
 

@@ -115,6 +115,9 @@ def test_gradients_are_clipped_as_those_of_the_published_loss(windows):
         for length in (protocol.length, 50):
             clip = dvae.method("gsps").training(Poses.from_data(protocol, skeleton, length)).gradient_clip
             assert clip * length == pytest.approx(100)
+    for name in ("", "walker"):
+        poses = Poses.from_data(motion.PROTOCOLS["simulated"], replace(motion.WALKER, name=name))
+        assert dvae.method("gsps").training(poses).gradient_clip == 10
 
     method = dvae.method("gsps", **SMALL).resolve_defaults(windows)  # windows of 75 frames
     objective, data, steps = method.objective(), batch(windows), {}
