@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -549,6 +550,12 @@ def compare(
     rows = loading.rows(loaded)
     models: dict[str, Any] = {name: [each.model for each in row] for name, row in rows.items()}
     models |= _mixtures(loaded) if ensembles else {}
+    if by_forecast := [name for name, row in rows.items() if any(r.config.training.select == "forecast" for r in row)]:
+        warnings.warn(
+            f"forecasts selected the weights of {', '.join(by_forecast)}, so these bounds are not their best; fit with "
+            "--select bound to compare bounds",
+            stacklevel=2,
+        )
     result = compare_models(
         models,
         windows,

@@ -235,7 +235,8 @@ def rows(loaded_runs: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     for name in [name for name, count in Counter(names).items() if count > 1]:
         indices = [index for index, other in enumerate(names) if other == name]
         grid = [_sweep_name(list(rows.values())[index]) for index in indices]
-        if name == Equations.name and all(grid) and len({*grid}) == len(grid):  # shorter than the differing options
+        is_distinct = all(grid) and len({*grid, *names}) == len({*names}) + len(grid)
+        if name == Equations.name and is_distinct:  # shorter than the differing options
             names = [grid[indices.index(index)] if index in indices else other for index, other in enumerate(names)]
             continue
         for index, label in zip(indices, _distinct_labels([firsts[index] for index in indices]), strict=True):
@@ -278,6 +279,7 @@ def config_without_seed(run: runs.Loaded) -> dict[str, Any]:
     config = Run(run.path).config
     aside = {"seed", "progress", "log_every"}
     training = {key: value for key, value in config["training"].items() if key not in aside}
+    config = {name: value for name, value in config.items() if name != "validation_data"}  # older runs have none
     return {**config, "training": training, "data": {k: v for k, v in config["data"].items() if k != "path"}}
 
 

@@ -388,7 +388,9 @@ def ablate(
             notes[edge.run] = f"not fitted: {error}"
         else:
             methods[edge.run] = reduced
-    options = training if isinstance(training, Training) else {"progress": progress, **(training or {})}
+    # costs are differences of bounds, so the bound selects the weights
+    defaults: dict[str, Any] = {"progress": progress, "select": "bound", "patience": None}
+    options = training if isinstance(training, Training) else {**defaults, **(training or {})}
     results = sweep(methods, data, out, seeds, training_of(full, data, options), jobs)
     require_ended(results)
     comparison = compare(

@@ -121,10 +121,11 @@ def _training(options: Any) -> dict[str, Any]:
     """
     if not isinstance(options, dict):
         raise ValueError(f"it must be a table of options such as steps, got {reprlib.repr(options)}")
-    option_names = {option.name for option in fields(Training)} - {"seed", "devices"}
+    option_names = {option.name for option in fields(Training)} - {"seed", "devices", "scheduled_sampling"}
+    hints = {"seed": "; give seeds = [...] instead", "scheduled_sampling": "; give it as an option of the methods"}
     for name in options:
         if name not in option_names:
-            hint = "; give seeds = [...] instead" if name == "seed" else nearest(name, option_names)
+            hint = hints.get(name) or nearest(name, option_names)
             raise ValueError(f"unknown training option {name!r} of a sweep{hint}")
     Training(**options)
     return options
@@ -136,6 +137,8 @@ def _methods(name: str, table: Mapping[str, Any], options: Mapping[str, Any], li
     kind, variations = settings.pop(METHOD, EQUATIONS), settings.pop(EACH, {})
     if not isinstance(kind, str) or not isinstance(variations, dict):
         raise ValueError("`method` must be a name, and `each` a table of options with lists of values")
+    if both := variations.keys() & table.keys():
+        raise ValueError(f"{', '.join(sorted(both))} has one value and several in `each`; remove one of them")
     count = 1
     for option, values in variations.items():
         if not isinstance(values, list) or not values:

@@ -150,6 +150,11 @@ def sweep(
         raise ValueError("jobs is 0; it must be the number of runs at a time, or -1 for one per core")
     if devices := [run.training.devices for run in runs if run.training.devices != 1]:
         raise ValueError(f"devices is {devices[0]}, but a run of a sweep uses one device; call dvae.fit for more")
+    if any(run.training.scheduled_sampling != 0 for run in runs):
+        raise ValueError(
+            "scheduled_sampling is an option of methods, which set its schedule; pass it to dvae.method(…), not as an "
+            "option of training"
+        )
     results = {run.path: result for run in runs if (result := _earlier_outcome(run)) is not None}
     pending = [run for run in runs if run.path not in results]
     notes: list[str] = []

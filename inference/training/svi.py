@@ -464,7 +464,8 @@ class SVI:
         score = -row[NAME] if by_forecast else -row[f"{prefix}loss"] if by_loss else row[f"{prefix}bound"]
         if not prefix or self.rates(state.step - 1)["scheduled_sampling"] == self.final_feeding:
             state.waited += 1
-            if state.best_step is not None and not self._are_comparable(state.best_step, state.step, by_loss):
+            before = None if by_forecast else state.best_step
+            if before is not None and not self._are_comparable(before, state.step, by_loss):
                 state.best_bound = None
             if math.isfinite(score) and (state.best_bound is None or score > state.best_bound):
                 state.best_step, state.best_bound, state.waited = state.step, score, 0

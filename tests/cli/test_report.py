@@ -228,6 +228,7 @@ def test_records_of_a_run_are_reported(scored, tmp_path):
 def test_bounds_omit_scores_that_are_shown_above(fitted, scored):
     few = sections.SelectedWindows(dvae.load(fitted).data.windows("test"), 3)
     unscored, omitted = (document("a", [sections.weighed({"a": dvae.load(run)}, few, 4)]) for run in (fitted, scored))
+    assert "Of 3 test windows, evenly spread, with K = 4 particles each." in unscored
     assert "ELBO ↑" in unscored
     assert "ELBO ↑" not in omitted
     assert "IWAE bound" in omitted

@@ -1,11 +1,13 @@
 """Grids: a file defines the methods and run names of a sweep, and the same command resumes it."""
 
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pytest
 
 import dvae
-from dvae.cli import main
+from dvae.cli import loading, main
 from dvae.runs.grid import Grid
 
 STUDY = """
@@ -75,6 +77,7 @@ def test_options_of_the_file_override_common_options(study):
     }
 
 
+@pytest.mark.filterwarnings("default:forecasts selected the weights of filter")
 def test_a_sweep_of_a_grid_is_fitted_and_resumed(study, table, tmp_path, capsys):
     out = tmp_path / "runs"
     command = ["sweep", "--grid", str(study), "--data", str(table), "--out", str(out), "--jobs", "1", "--warm-up", "1"]
@@ -87,7 +90,9 @@ def test_a_sweep_of_a_grid_is_fitted_and_resumed(study, table, tmp_path, capsys)
     assert "by an earlier sweep" in capsys.readouterr().err
     assert before == {path: path.stat().st_mtime_ns for path in out.rglob("best.safetensors")}
     assert main(["compare", *(str(out / name) for name in sorted(names)), "--particles", "2", "--no-forecasts"]) == 0
-    assert "teacher-forced" in capsys.readouterr().out
+    shown = capsys.readouterr()
+    assert "teacher-forced" in shown.out
+    assert "fit with --select bound to compare bounds" in shown.err
 
 
 @pytest.fixture
@@ -108,6 +113,8 @@ def table(tmp_path):
         ("training = 3\n[a]\nmethod='vae'", r"\[training\]: it must be a table"),
         ("training.stepz = 3\n[a]\nmethod='vae'", r"\[training\]: .* 'stepz' .*did you mean 'steps'"),
         ("training.seed = 3\n[a]\nmethod='vae'", r"seeds = \[...\] instead"),
+        ("training.scheduled_sampling = 0.5\n[a]\nmethod='srnn'", "give it as an option of the methods"),
+        ("[a]\nmethod='vae'\nlatent=3\neach.latent=[2, 4]", r"\[a\]: latent has one value and several in `each`"),
         ("['../a']\nmethod='vae'", "cannot name run directories"),
         ("[a]\neach.inference=['faithful', 'q(z_t | x_t)']", "each text value its own table"),
         ("[a]\nmethod='vae'\neach.latent=[3]\n['a-latent=3']\nmethod='srnn'", "two tables give a run the name"),
@@ -139,3 +146,20 @@ def test_the_command_line_accepts_methods_or_a_grid(study, tmp_path, capsys):
     study.write_text(STUDY.replace("steps = 2", "steps = 0"))
     assert main(["sweep", "--grid", str(study), *out]) == 2
     assert "steps is 0" in capsys.readouterr().err
+
+
+def test_equations_named_like_a_method_keep_their_own_row(people, tmp_path):
+    data = dvae.motion.MotionData.open(people)
+    small = {"width": 2, "latent": 2}
+    methods = {
+        "grid/srnn": dvae.method("equations", **small),
+        "grid/filter": dvae.method("equations", inference="q(z_t | z_{t-1}, x_t)", **small),
+        "paper/srnn": dvae.method("srnn", warm_up=0, **small),
+    }
+    paths = [tmp_path / f"{name}-seed{seed}" for name in methods for seed in (0, 1)]
+    for path, (method, seed) in zip(paths, product(methods.values(), (0, 1)), strict=True):
+        method = replace(method, warm_up=0)
+        dvae.fit(method, data, out=path, steps=1, batch_size=2, seed=seed, progress=False)
+    rows = loading.rows([dvae.load(path) for path in paths])
+    assert [[run.path for run in row] for row in rows.values()] == [paths[:2], paths[2:4], paths[4:]]
+    assert [*loading.rows([dvae.load(path) for path in paths[:4]])] == ["srnn", "filter"]

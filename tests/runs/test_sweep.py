@@ -87,6 +87,14 @@ def test_finished_runs_are_not_repeated(swept, data, capsys):
     assert "vae-z3-seed0 finished at step 6 by an earlier sweep, best bound" in str(again[0])
 
 
+def test_the_log_may_change_between_sweeps_but_scheduled_sampling_belongs_to_methods(swept, data):
+    out, methods, results = swept
+    again = sweep(methods, data, out, seeds=(0, 1), training=replace(TRAINING, log_every=2))
+    assert again == [replace(result, seconds=0.0) for result in results]
+    with pytest.raises(ValueError, match="scheduled_sampling is an option of methods"):
+        sweep(methods, data, out, seeds=(0, 1), training=replace(TRAINING, scheduled_sampling=0.5))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

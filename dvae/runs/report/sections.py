@@ -309,7 +309,6 @@ def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int 
     """
     likely = {name: run.model for name, run in runs.items() if run.model.likelihood}
     settings: dict[str, Any] = {"particles": particles, "contrasts": 0, "samples": 0, "seed": seed}
-    explanation = f"Of {len(windows.keys)} test windows, evenly spread, with {particles} particles each."
     title = "Bounds, KL over time, k-hat"
     try:
         comparison = compare(likely, windows, **settings) if likely else None
@@ -323,6 +322,8 @@ def weighed(runs: Runs, windows: HeldOutWindows, particles: int = 64, seed: int 
             )
         return _evidence(comparison, name)
 
+    particles = comparison.particles if comparison else particles  # 1 if a model has a bound in place of a density
+    explanation = f"Of {len(windows.keys)} test windows, evenly spread, with K = {particles} particles each."
     omitted = ["seeds", *(["ELBO", "KL"] if all(_has_elbo(runs[name]) for name in likely) else [])]
     table = tabulated(comparison.table(), omitted) if comparison else ""
     return Section(title, {name: cell(name) for name in runs}, explanation, table)
