@@ -253,6 +253,7 @@ def test_forecasts_beyond_the_end_of_the_table(table_runs, table, tmp_path, caps
     assert forecasts["truth"].isna().all()
 
 
+@pytest.mark.filterwarnings("default:forecasts selected the weights of vae, autoregressive")
 def test_runs_are_compared_criticised_resumed_and_swept(table_runs, table, tmp_path, capsys):
     both = [str(table_runs / name) for name in ("vae", "autoregressive")]
     few = ["--particles", "2", "--samples", "2", "--contrasts", "0", "--stride", "4"]
