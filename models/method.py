@@ -345,7 +345,7 @@ def rising(level: float, steps: int) -> Ramp:
 
 def fit_units(model: DynamicalVAE, train: Any) -> None:
     """Fit the units of x in a model to 1024 windows of the training data, in the model's view."""
-    data = model.read(train.sample(1024, torch.default_generator), precise=True)
+    data = model.read(as_source(train).sample(1024, torch.default_generator), precise=True)
     model.units[WHOLE].fit(interpolate_missing(data[WHOLE], data.mask()))
 
 

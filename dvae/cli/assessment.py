@@ -552,8 +552,8 @@ def compare(
     models |= _mixtures(loaded) if ensembles else {}
     if by_forecast := [name for name, row in rows.items() if any(r.config.training.select == "forecast" for r in row)]:
         warnings.warn(
-            f"forecasts selected the weights of {', '.join(by_forecast)}, so these bounds are not their best; fit with "
-            "--select bound to compare bounds",
+            f"forecasts selected the weights of {', '.join(by_forecast)}, so their bounds may be below the best; fit "
+            "with --select bound to compare bounds",
             stacklevel=2,
         )
     result = compare_models(

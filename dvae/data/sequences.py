@@ -214,10 +214,9 @@ class RandomMasking:
         return batch | {"mask": {**batch["mask"], "x": visible} if isinstance(batch.get("mask"), Mapping) else visible}
 
     @property
-    def fingerprint(self) -> str:
+    def fingerprint(self) -> str | None:
         """Fingerprint of the source, if it has one."""
-        fingerprint: str = self.source.fingerprint
-        return fingerprint
+        return getattr(self.source, "fingerprint", None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,10 +253,9 @@ class RandomGiven:
         return batch | {"given": given.to(batch["x"].device)}
 
     @property
-    def fingerprint(self) -> str:
+    def fingerprint(self) -> str | None:
         """Fingerprint of the source, if it has one."""
-        fingerprint: str = self.source.fingerprint
-        return fingerprint
+        return getattr(self.source, "fingerprint", None)
 
 
 def mean_of_known(values: Tensor, dims: int | tuple[int, ...]) -> Tensor:
@@ -528,10 +526,10 @@ class ArrayWindows:
 
     def __post_init__(self) -> None:
         if isinstance(self.x, Mapping):
-            names = ", ".join(map(str, self.x))
+            advice = "pass it as it is to dvae.fit and dvae.compare, which compares bounds"
+            advice = 'pass batch["x"], and its mask as mask=…' if "x" in self.x else advice
             raise TypeError(
-                f"windows have one array x (N, T, D), but this is a batch of {names}; pass it as it is to dvae.fit and "
-                "dvae.compare, which compares bounds"
+                f"windows have one array x (N, T, D), but this is a batch of {', '.join(map(str, self.x))}; {advice}"
             )
         check_real(self.x, "x")
         require(Count, observed=self.observed)

@@ -321,7 +321,8 @@ def ablate(
             `dvae.tables.PanelData`.
         out: directory for the run directories.
         seeds: seeds of the runs of each edge.
-        training: all training options of the runs, or those that replace the defaults of `equations`.
+        training: all training options of the runs, or those that replace the defaults of `equations`; the bound selects
+            the weights.
         jobs: number of runs in parallel.
         observed: names of the observed variables, if there are no data.
         sizes: sizes of the variables of the surrogates; by default 2 for data and 1 for others.

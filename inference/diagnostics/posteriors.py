@@ -406,8 +406,8 @@ def _root(curvature: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     root, failed = torch.linalg.cholesky_ex(prior)
     if (prior.diagonal(dim1=-2, dim2=-1) == 0).any():
         raise ValueError(
-            "the prior does not depend on some latents, such as those after the last step of a shorter sequence; pass "
-            "sequences of one length, cut at their last step"
+            "the prior has no curvature in some latents, as a Laplace distribution, or after the last step of a "
+            "shorter sequence; use priors such as normals, and sequences of one length"
         )
     if failed.any():
         raise ValueError(

@@ -146,7 +146,7 @@ def require_readable(name: str, model: Any, batch: Batch) -> None:
         batch: the sequences; only the first is read.
     """
     if isinstance(model, DynamicalVAE):
-        if WHOLE not in (*model.observed, *model.view.names) and WHOLE in batch:
+        if WHOLE not in (*model.observed, *model.context, *model.view.names) and WHOLE in batch:
             own = ", ".join(model.observed)
             raise ValueError(
                 f"{name} has no data variable x, as windows have, but {own}; pass a batch of these to dvae.compare, "

@@ -243,7 +243,7 @@ def fit(
             stays.
         Interrupted: after Ctrl-C or SIGTERM; the step is complete and the checkpoint written.
         CheckpointError: when `out` contains a run and `resume` is False, or a run that cannot be resumed, such as one
-            fitted on training data with another `fingerprint`.
+            fitted on training or validation data with another `fingerprint`.
         TypeError: when the model or the data are of another kind, such as a table, whose columns need roles.
         ValueError: when the first batch varies by less than float32 resolves, an option is set by the method or recipe
             itself, or a part of the data has no windows.
@@ -368,6 +368,11 @@ def _fit(
     prints = {name: part.fingerprint for name, part in parts.items() if isinstance(part, Fingerprinted)}
     record = {name: fingerprint for name, fingerprint in prints.items() if isinstance(fingerprint, str)}
     run = run_directory(out, resume, record)
+    if run is not None and resume and held_out is None and run.state["best_step"] is not None:
+        raise CheckpointError(
+            f"{run.path} selects its weights on validation data; pass these data to resume it, or start a new run in "
+            "another directory"
+        )
     record |= recorded(training, svi.plan)
     with ExitStack() as stack:
         stack.callback(model.eval)
@@ -380,11 +385,6 @@ def _fit(
         processes.wait(svi.fabric)  # every process must look for an earlier run before the first one writes
         if run is not None and resume:
             restore(svi, run)
-            if held_out is None and state.best_step is not None:
-                raise ValueError(
-                    f"{run.path} selects its weights on validation data; pass these data to resume it, or start a new "
-                    "run in another directory"
-                )
             processes.wait(svi.fabric)  # every process must read the checkpoint before the first one writes
         history, receivers = InMemory(), list[Tracker]()
         if first:

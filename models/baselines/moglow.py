@@ -39,7 +39,7 @@ from typing_extensions import override
 
 from ...data.batch import WHOLE
 from ...data.schema import Schema
-from ...data.sequences import interpolate_missing
+from ...data.sequences import as_source, interpolate_missing
 from ...distributions import FAMILIES, ConditionalFlow, DistributionSpec, Product
 from ...distributions.conditional_flow import ConditionalFlowModule
 from ...distributions.product import ProductModule
@@ -139,7 +139,8 @@ class MoGlow(LikelihoodMethod):
 
 def start_flow(model: DynamicalVAE, windows: Any) -> None:
     """Fit the unit of x, if any, to 256 windows, and initialise flows with them (`ConditionalFlowModule.start_at`)."""
-    batch, distribution = windows.sample(256, torch.default_generator), model.generator[WHOLE].head
+    batch = as_source(windows).sample(256, torch.default_generator)
+    distribution = model.generator[WHOLE].head
     if WHOLE in model.units and not model.units[WHOLE].scale.dim():  # units of columns are known
         exact = model.read(batch, precise=True)
         model.units[WHOLE].fit(interpolate_missing(exact[WHOLE], exact.mask()))

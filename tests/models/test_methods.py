@@ -290,15 +290,22 @@ def test_hidden_entries_are_single_columns_of_arrays_and_whole_steps_of_a_diffus
 
 
 @pytest.mark.parametrize("name", ["equations", "rslds"])
-def test_recipes_of_arrays_are_prepared_like_those_of_windows(name):
+def test_recipes_of_arrays_are_prepared_and_stored_like_those_of_windows(name, tmp_path):
     prior = {"prior": "vamp", "prior_components": 3, "prior_steps": 4}
     equations = {"generative": "p(w) p(x_t | w)", "inference": "q(w | x_{1:T})"}
     options = {"rslds": {}, "equations": equations | prior}[name]
     method = small(name, hide=0.2, warm_up=1, **options)
     x = torch.randn(4, 6, 3)
     model = method.build({"x": 3})
-    dvae.fit(model, method.train(x, steps=2), batch_size=2, accelerator="cpu", progress=False)
+    dvae.fit(model, method.train(x, steps=2), out=tmp_path, batch_size=2, accelerator="cpu", progress=False)
     assert torch.isfinite(torch.cat([parameter.flatten() for parameter in model.parameters()])).all()
+
+
+@pytest.mark.parametrize("name", ["erd", "aclstm", "moglow"])
+def test_units_of_arrays_are_fitted(name):
+    model, x = dvae.method(name, width=4).build({"x": 3}), 5 + torch.randn(8, 6, 3)
+    dvae.fit(model, dvae.method(name, width=4).train(x, steps=2), batch_size=2, accelerator="cpu", progress=False)
+    assert (model.units["x"].mean - 5).abs().max() < 1
 
 
 def test_scheduled_sampling_does_not_apply_to_models_that_read_no_data():

@@ -130,7 +130,7 @@ def test_unsupported_programs_are_errors():
             dvae.posterior(program, batch, descent=QUICK)
     model = dvae.linear_gaussian_surrogate("p(z_t) p(x_t | z_t)", "q(z_t | x_t)", {"z": 1, "x": 1}, 3)
     ragged = {"x": model.sample(2, 3)["x"], "lengths": torch.tensor([3, 2])}
-    with pytest.raises(ValueError, match="after the last step of a shorter sequence"):
+    with pytest.raises(ValueError, match="after the last step of a shorter sequence; use priors such as normals"):
         dvae.posterior(model.model, ragged, descent=BRIEF)
     with pytest.raises(ValueError, match="at least as many candidates"):
         dvae.Descent(starts=5, candidates=4)

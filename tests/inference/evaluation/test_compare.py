@@ -411,6 +411,10 @@ def test_models_of_several_variables_are_compared_by_bounds():
     for score in (run, evaluate):
         with pytest.raises(ValueError, match="two has no data variable x, as windows have, but n, y; pass a batch"):
             score({"two": model}, ArrayWindows(batch["y"], 4))
+    given_x = DynamicalVAE("p(z_t) p(y_t | z_t, x_t)", "q(z_t | y_t, x_t)", {"z": 1, "y": 1, "x": 1}, observed=("y",))
+    assert run({"given x": given_x}, {"y": batch["y"], "x": batch["n"]}).ranking == ["given x"]
+    with pytest.raises(TypeError, match=r'a batch of x, mask; pass batch\["x"\], and its mask'):
+        ArrayWindows({"x": batch["y"], "mask": batch["y"] > 0}, 4)
     with pytest.raises(TypeError, match=r"one array x .* but this is a batch of n, y; pass it as it is to dvae.fit"):
         ArrayWindows(batch, 4)
 

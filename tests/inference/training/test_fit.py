@@ -298,7 +298,7 @@ def test_resuming_on_other_data_is_an_error(tmp_path):
     ):
         with pytest.raises(CheckpointError, match=message):
             run(None, *parts, out=tmp_path, steps=10, resume=True)
-    with pytest.raises(ValueError, match="selects its weights on validation data; pass these data"):
+    with pytest.raises(CheckpointError, match="selects its weights on validation data; pass these data"):
         run(train=train, out=tmp_path, steps=10, resume=True)
     assert run(train=train, validation=held_out, out=tmp_path, steps=10, resume=True).step == 10
 
@@ -407,7 +407,7 @@ def test_an_existing_run_is_never_overwritten_or_resumed_implicitly(finished):
     with pytest.raises(CheckpointError, match="resume"):
         run(out=finished / "elsewhere", resume=True)
     with pytest.raises(CheckpointError, match="fitted with"):
-        run(out=finished, resume=True, optimizer="sgd")
+        run(validation=HELD_OUT, out=finished, resume=True, optimizer="sgd")
 
 
 @pytest.mark.parametrize(
@@ -424,7 +424,7 @@ def test_a_damaged_file_is_an_error_with_its_name(finished, name, damage):
         path.write_bytes(content if damage == "flipped" else content[:-40])
     expected = "is missing; copy the run directory whole" if damage == "missing" else "is damaged or from another run"
     with pytest.raises(CheckpointError, match=f"{name} {expected}"):
-        run(out=finished, steps=10, resume=True)
+        run(validation=HELD_OUT, out=finished, steps=10, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -440,7 +440,7 @@ def test_a_state_without_fingerprints_is_an_error(finished, state, message):
         with pytest.raises(CheckpointError, match=message):
             load_weights(build(), path)
     with pytest.raises(CheckpointError, match=r"state\.json is damaged"):
-        run(out=finished, steps=10, resume=True)
+        run(validation=HELD_OUT, out=finished, steps=10, resume=True)
 
 
 def test_weights_of_another_model_are_an_error(finished, tmp_path):
@@ -470,7 +470,7 @@ def test_an_optimiser_state_is_never_unpickled(finished):
     for content in (pickle.dumps(Hostile()), buffer.getvalue()):
         Run(finished).commit(Run(finished).state, {"last.state.safetensors": content})
         with pytest.raises(CheckpointError, match="safetensors file"):
-            run(out=finished, steps=10, resume=True)
+            run(validation=HELD_OUT, out=finished, steps=10, resume=True)
 
 
 STATE = {"step": 0, "best_step": None, "best_bound": None, "waited": 0, "status": "running", "optimizer": "adam"}
