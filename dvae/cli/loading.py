@@ -235,7 +235,7 @@ def rows(loaded_runs: Sequence[runs.Loaded]) -> dict[str, list[runs.Loaded]]:
     for name in [name for name, count in Counter(names).items() if count > 1]:
         indices = [index for index, other in enumerate(names) if other == name]
         grid = [_sweep_name(list(rows.values())[index]) for index in indices]
-        is_distinct = all(grid) and len({*grid, *names}) == len({*names}) + len(grid)
+        is_distinct = all(grid) and len({*grid}) == len(grid) and not {*grid} & {*names}
         if name == Equations.name and is_distinct:  # shorter than the differing options
             names = [grid[indices.index(index)] if index in indices else other for index, other in enumerate(names)]
             continue

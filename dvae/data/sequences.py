@@ -526,8 +526,8 @@ class ArrayWindows:
 
     def __post_init__(self) -> None:
         if isinstance(self.x, Mapping):
-            advice = "pass it as it is to dvae.fit and dvae.compare, which compares bounds"
-            advice = 'pass batch["x"], and its mask as mask=…' if "x" in self.x else advice
+            has_x, bounds = "x" in self.x, "pass it as it is to dvae.fit and dvae.compare, which compares bounds"
+            advice = 'pass batch["x"], and its mask as mask=…' if has_x else bounds
             raise TypeError(
                 f"windows have one array x (N, T, D), but this is a batch of {', '.join(map(str, self.x))}; {advice}"
             )

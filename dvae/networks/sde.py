@@ -254,15 +254,23 @@ class LinearSDENetwork(Network):
     @override
     def step(self, state: Any, t: int, samples: Mapping[str, Sequence[Tensor]]) -> tuple[Tensor, Any]:
         transitions, previous, lengths = state
-        decay, whitening = (
-            self.drawn_over(t, samples, lengths) if transitions is None else (part[t] for part in transitions)
-        )
+        decay, whitening = self.transition_at(t, transitions, lengths, samples)
         return _features(decay, None, whitening, self._last(previous, t, samples, decay)), state
 
-    def drawn_over(
-        self, t: int, samples: Mapping[str, Sequence[Tensor]], lengths: Tensor | None
+    def transition_at(
+        self, t: int, transitions: Any, lengths: Tensor | None, samples: Mapping[str, Sequence[Tensor]]
     ) -> tuple[Tensor, Tensor]:
-        """Return F and the whitening matrix of Q, (B, D, D) each, at step t of a loop that draws the gaps."""
+        """Return F and the whitening matrix of Q, (B, D, D) each, at step t.
+
+        Args:
+            t: the step, counted from 0.
+            transitions: both for all steps, or None if the loop draws the gaps.
+            lengths: (B,) number of valid steps of each sequence, or None.
+            samples: as in `step`.
+        """
+        if transitions is not None:
+            decays, whitenings = transitions
+            return decays[t], whitenings[t]
         gaps = samples[self.gap][t]
         has_previous = torch.full_like(gaps, t > 0, dtype=torch.bool)
         if lengths is not None:
@@ -305,9 +313,7 @@ class LinearSDEGuideNetwork(LinearSDENetwork):
         if potential is None:
             decay, offset, whitening = (part[t] for part in transitions)
             return _features(decay, offset, whitening, self._last(previous, t, samples, decay)), state
-        decay, whitening = (
-            self.drawn_over(t, samples, lengths) if transitions is None else (part[t] for part in transitions)
-        )
+        decay, whitening = self.transition_at(t, transitions, lengths, samples)
         features, potential = self.potential.step(potential, t, samples)
         last = self._last(previous, t, samples, decay)
         return _features(*self.updated(decay, whitening, features), last), (transitions, previous, lengths, potential)

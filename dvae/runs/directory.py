@@ -132,7 +132,7 @@ class Loaded:
 
 
 def in_command(path: str | os.PathLike[str]) -> str:
-    """Return a path as it is written in a command, quoted if necessary."""
+    """Return a path for a shell command, quoted if necessary."""
     text = os.fspath(path)
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
 

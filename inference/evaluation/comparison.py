@@ -475,7 +475,7 @@ class Comparison(Result):
             raise KeyError(f"{name!r} has no score {metric!r}{nearest(metric, names)}; it has {', '.join(names)}")
         places = cluster_index(self.keys).numpy()
         if metric in row.free_running:
-            valid = ~np.isnan(row.free_running[metric]).any(0)  # without clusters in which no window has the score
+            valid = ~np.isnan(row.free_running[metric]).any(0)  # clusters with a scored window
             return TwoWayErrors.of(row.free_running[metric][:, valid], np.bincount(places)[valid].astype(float))
         weights = self.n_forecast if metric == "LFO" and self.n_forecast is not None else self.n_steps
         return TwoWayErrors.by_cluster(row.bounds[metric], weights, places)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -43,7 +42,7 @@ from ...options import flat
 from ...program.batch import repeat
 from ...program.protocols import Program
 from ..ablation import Ablation
-from ..directory import Loaded
+from ..directory import Loaded, in_command
 from .page import Section, command, missing_part, paragraph, picture, side_by_side, tabulated
 
 Runs = Mapping[str, Loaded]
@@ -426,7 +425,7 @@ def _missing(run: Loaded, file: str, results: str, name: str) -> Markup:
 
 
 def _command(run: Loaded, name: str) -> Markup:
-    return command("dvae", *name.split(), shlex.quote(str(run.path)))
+    return command("dvae", *name.split(), in_command(run.path))
 
 
 def _record(run: Loaded, name: str) -> str | None:
