@@ -130,7 +130,10 @@ def _fans(by_name: Mapping[str, Any], windows: PanelWindows, count: int, samples
             *(picture(figure, f"forecasts of {name} from step {step}") for figure, (name, step) in figures)
         )
 
-    caption = "Grey: observed. Black: true future. Blue: median, and intervals of 50, 80 and 95 % of the forecasts."
+    caption = (
+        "Grey: observed. Black: true future. Blue: median, and intervals of 50, 80 and 95 % of the forecasts; for "
+        "binary values, their share."
+    )
     return Section("Futures", sections.cells(by_name, cell, "futures"), caption)
 
 

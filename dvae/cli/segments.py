@@ -52,14 +52,16 @@ APART, FARTHER = 3.0, 1.3
 def _save_page(
     out: Path, motions: motion.MotionSet, names: Sequence[str], truth: motion.MotionSet | None = None
 ) -> None:
-    """Write a page with clips that move side by side; a shorter clip keeps its last pose."""
+    """Write a page with clips that move side by side; a shorter clip disappears at its end."""
     from ..motion.drawing.player import animate
 
     clips = [*motions, *(truth or ())]
     frames = max(clip.frames for clip in clips)
-    still = np.stack([np.pad(c.positions, ((0, frames - c.frames), (0, 0), (0, 0)), mode="edge") for c in clips])
-    samples, real = still[: len(motions), 1:], None if truth is None else still[-1, 1:]
-    animate(motions.skeleton, still[0, :1], samples, real, names=names).save(out)
+    padded = np.full((len(clips), frames, *clips[0].positions.shape[1:]), np.nan)
+    for row, clip in zip(padded, clips, strict=True):
+        row[: clip.frames] = clip.positions
+    samples, real = padded[: len(motions)], None if truth is None else padded[-1]
+    animate(motions.skeleton, samples[0, :0], samples, real, names=names).save(out)
 
 
 def _single_clip(motions: motion.MotionSet, clip: motion.Clip) -> motion.MotionSet:

@@ -76,7 +76,8 @@ class Diffusion:
             schedule, minus the log density of N(m, s^2). It has more weight at high noise levels, so that draws are
             better and the bound is lower. Training then reports it as an energy; evaluation has the bound.
         steps: number of steps of the sampler.
-        sampler: "ancestral", "ddim", or "heun" (second order in data prediction, with two evaluations a step).
+        sampler: "ancestral", "ddim", "dpm" (DPM-Solver++(2M), Lu et al., 2022, arXiv 2211.01095: second order, with one
+            evaluation a step), or "heun" (two evaluations a step).
         drop: probability that training hides the features of a sequence, for guidance; `log_prob` in training mode is
             then a bound of the marginal density for these sequences.
         guidance: weight g of the conditional v in draws, v_0 + g (v_h - v_0); 1 for none (Ho and Salimans, 2022,
@@ -91,8 +92,8 @@ class Diffusion:
     log_snr: tuple[float, float] = (-10.0, 10.0)
     shift: float = 0.0
     loss: Literal["bound", "velocity"] = "bound"
-    steps: int = 20
-    sampler: Literal["ancestral", "ddim", "heun"] = "heun"
+    steps: int = 40
+    sampler: Literal["ancestral", "ddim", "dpm", "heun"] = "dpm"
     drop: float = 0.0
     guidance: float = 1.0
     min_scale: float = 1e-3
@@ -113,10 +114,10 @@ class Diffusion:
             ValueError: an option is out of range or does not fit the variable.
         """
         require(Positive, min_scale=self.min_scale)
-        if self.schedule not in ("learned", "cosine") or self.sampler not in ("ancestral", "ddim", "heun"):
+        if self.schedule not in ("learned", "cosine") or self.sampler not in ("ancestral", "ddim", "dpm", "heun"):
             raise ValueError(
-                "a Diffusion has the schedule 'learned' or 'cosine' and the sampler 'ancestral', 'ddim' or 'heun', got "
-                f"schedule={self.schedule!r} and sampler={self.sampler!r}"
+                "a Diffusion has the schedule 'learned' or 'cosine' and the sampler 'ancestral', 'ddim', 'dpm' or "
+                f"'heun', got schedule={self.schedule!r} and sampler={self.sampler!r}"
             )
         if self.loss not in ("bound", "velocity") or (self.loss == "velocity" and self.schedule == "learned"):
             raise ValueError(
@@ -149,13 +150,13 @@ class FlowMatching:
     Args:
         scale: the scale s, above 0.
         hidden, denoiser, steps, drop, guidance, residual: as in `Diffusion`.
-        sampler: "ddim" (first order) or "heun".
+        sampler: "ddim", "dpm" or "heun", as in `Diffusion`.
     """
 
     hidden: tuple[int, ...] = (128, 128)
     denoiser: DenoiserSpec | None = None
-    steps: int = 20
-    sampler: Literal["ddim", "heun"] = "heun"
+    steps: int = 40
+    sampler: Literal["ddim", "dpm", "heun"] = "dpm"
     drop: float = 0.0
     guidance: float = 1.0
     scale: float = 1.0
@@ -175,9 +176,9 @@ class FlowMatching:
         Raises:
             ValueError: an option is out of range or does not fit the variable.
         """
-        if self.scale <= 0 or self.sampler not in ("ddim", "heun"):
+        if self.scale <= 0 or self.sampler not in ("ddim", "dpm", "heun"):
             raise ValueError(
-                "FlowMatching needs a `scale` above 0 and the sampler 'ddim' or 'heun', got "
+                "FlowMatching needs a `scale` above 0 and the sampler 'ddim', 'dpm' or 'heun', got "
                 f"scale={self.scale} and sampler={self.sampler!r}"
             )
         return FlowMatchingModule(self, shape)
@@ -259,14 +260,16 @@ class DenoisingModule(ConditionalDistribution):
                 v = torch.lerp(self.denoiser(z, angle, hidden, *steps), v, spec.guidance)
             return angle.cos() * z - angle.sin() * v
 
-        for before, after in pairwise(levels):
+        earlier = torch.zeros_like(z)
+        for before, after, share in zip(levels, levels[1:], _extrapolation(torch.stack(levels)), strict=False):
             u = denoised(z, before)
             if spec.sampler == "ancestral":
                 kept = (after.tan() / before.tan()).square()
                 mean = after.cos() * (kept / before.cos() * z + (1 - kept) * u)
                 z = mean + after.sin() * (1 - kept).sqrt() * torch.randn_like(z)
                 continue
-            next_z = _toward(z, u, before, after)
+            estimate, earlier = (u + share * (u - earlier) if spec.sampler == "dpm" else u), u
+            next_z = _toward(z, estimate, before, after)
             if spec.sampler == "heun":
                 next_z = _toward(z, (u + denoised(next_z, after)) / 2, before, after)
             z = next_z
@@ -490,7 +493,7 @@ class DenoisingDistribution(TorchDistribution):
 
     @torch.no_grad()
     def exact_log_prob(self, value: Tensor, steps: int = 50, probes: int | None = None) -> ODEDensity:
-        """Return the log density by the probability-flow ODE, which draws of "ddim" and "heun" follow.
+        """Return the log density by the probability-flow ODE, which draws follow, except those of "ancestral".
 
         Draws of "ancestral" follow another distribution unless the denoiser is optimal. Guidance is ignored.
 
@@ -561,6 +564,17 @@ def small_linear(features: int, size: int) -> nn.Linear:
 def _toward(z: Tensor, u: Tensor, before: Tensor, after: Tensor) -> Tensor:
     """Return z at a lower level if u is the denoised value: cos(b) u + sin(b) / sin(a) (z - cos(a) u)."""
     return after.cos() * u + after.sin() / before.sin() * (z - before.cos() * u)
+
+
+def _extrapolation(levels: Tensor) -> Tensor:
+    """Return how far DPM-Solver++(2M) extrapolates the denoised values at each step, 0 at the first.
+
+    Args:
+        levels: angles (steps + 1,), decreasing.
+    """
+    drops = (levels.sin().log() - levels.cos().abs().log()).diff()  # of the log noise level, infinite at 0 and pi / 2
+    shares = functional.pad(drops[1:] / (2 * drops[:-1]), (1, 0))
+    return torch.where(shares.isfinite(), shares, 0.0)
 
 
 def _divergence(v: Tensor, z: Tensor, directions: Tensor, event: int) -> Tensor:

@@ -221,9 +221,7 @@ class DynamicalVAE(nn.Module):
         for name in self.latents:
             # minus a lower bound of the guide's density is an upper bound, so the ELBO would not be a bound
             for conditional, allowed in ((self.generator[name], ("exact", "bound")), (self.encoder[name], ("exact",))):
-                head = conditional.head
-                density = "loss" if head.trained_as_loss else head.density
-                if density not in allowed:
+                if (density := _density(conditional)) not in allowed:
                     raise ValueError(
                         f"{conditional.factor} has a {density} in place of a density, but the "
                         f"distribution of a latent needs a density{' or a bound' * ('bound' in allowed)}; use another "
@@ -243,6 +241,13 @@ class DynamicalVAE(nn.Module):
                     f"{name} is summed out over its {self.sizes[name]} states, but the distribution of "
                     f"{self.generator[name].factor} is {distribution}; use the default, a categorical distribution"
                 )
+            for conditional in self.generator.values():  # a sum of random bounds over states is above their bound
+                read = name in [parent.name for parent in conditional.factor.parents]
+                if read and (density := _density(conditional)) != "exact":
+                    raise ValueError(
+                        f"{conditional.factor} has a {density} in place of a density, so {name} cannot be summed out; "
+                        "use a distribution with a density, such as distributions.Normal()"
+                    )
 
     @torch.inference_mode(False)
     def standardise(
@@ -880,6 +885,12 @@ def _check_sizes(sizes: Mapping[str, int]) -> dict[str, int]:
         if error := problem(f"the size of {name}", size, Annotated[int, Range(1, 2**20)]):
             raise error
     return dict(sizes)
+
+
+def _density(conditional: Any) -> str:
+    """Return what a factor has for a density in training: "exact", a "bound" or a "loss"."""
+    head = conditional.head
+    return "loss" if head.trained_as_loss else str(head.density)
 
 
 def _by_factor(specs: Any, default: Any, label: str) -> dict[str, Any]:

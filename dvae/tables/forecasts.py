@@ -83,7 +83,8 @@ class PanelForecasts:
     def plot(self, window: int = 0, columns: Sequence[str] | None = None, most: int = 8) -> Figure:
         """Plot prediction bands (50, 80, 95 %) and the median of each coordinate, with the past and the truth.
 
-        For binary values, the plot shows the share of the draws. Intervals that need more draws are omitted (`needed`).
+        If all values of a coordinate are 0 or 1, the plot shows the share of the draws that are 1. Intervals that need
+        more draws are omitted (`needed`).
 
         Args:
             window: index of the window.
@@ -114,8 +115,8 @@ class PanelForecasts:
         for axis in panels[max(len(selected) - n_columns, 0) : len(selected)]:  # the lowest panel of each column
             axis.tick_params(labelbottom=True)
         legends = [axis.get_legend_handles_labels() for axis in panels[: len(selected)]]
-        handles, labels = max(legends, key=lambda entry: len(entry[1]))
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        entries = {label: handle for legend in legends for handle, label in zip(*legend, strict=True)}
+        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries))
         figure.suptitle(f"{self.keys[window][0]} from step {self.keys[window][1]}", parse_math=False)
         return figure
 
@@ -133,8 +134,9 @@ class PanelForecasts:
         if is_dated := self.times is not None and self.calendar.kind == "dates":
             steps = self.calendar.to_pandas(steps)
         past_steps, future_steps, draws = steps[:observed], steps[observed:], self.draws[:, window, :, index]
-        if np.isin(self.draws[..., index], (0, 1)).all():  # binary: a share instead of bands
-            axis.plot(future_steps, draws.mean(0), "C0")
+        values = np.concatenate([each[..., index].ravel() for each in (self.draws, self.past, self.truth)])
+        if np.isin(values[np.isfinite(values)], (0, 1)).all():  # binary: a share instead of bands
+            axis.plot(future_steps, draws.mean(0), "C0", label="share of draws")
             axis.set_ylabel("share")
             axis.set_ylim(-0.05, 1.05)
         else:

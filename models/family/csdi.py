@@ -65,7 +65,7 @@ class CSDI(LikelihoodMethod):
         layers: number of layers of each transformer.
         scheduled_sampling: always None.
         schedule: "learned" or "cosine", as in `Diffusion`.
-        sampler_steps: number of steps of the sampler, with two evaluations each.
+        sampler_steps: number of steps of the sampler.
     """
 
     name = "csdi"
@@ -87,7 +87,7 @@ class CSDI(LikelihoodMethod):
     heads_count: Size = 4
     layers: Layers = 2
     schedule: Literal["learned", "cosine"] = "learned"
-    sampler_steps: Count = 15
+    sampler_steps: Count = 30
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -173,18 +173,23 @@ class CSDIModel(DynamicalVAE):
 
     @override
     def impute(self, batch: AnyBatch, samples: int = 1, **options: Any) -> dict[str, Tensor]:
-        """Fill in missing entries, in windows that overlap by half if a sequence is longer than a training window."""
+        """Fill in missing entries, in windows that overlap by half if a sequence is longer than a training window.
+
+        A window is filled in given the draws of the windows before it, so that its draws continue theirs.
+        """
         values = Batch(batch if isinstance(batch, Mapping) else {WHOLE: batch})
         length, window = values[WHOLE].shape[1], self.window
-        if window is None or length <= window:
+        if window is None or length <= window or values.mask() is None:
             return super().impute(values, samples, **options)
+        count = len(values[WHOLE])
+        filled = values.map(lambda value: value.repeat(samples, *[1] * (value.ndim - 1)))
         starts = [*range(0, length - window, -(-window // 2)), length - window]
-        ends = [0, *(start + window // 4 for start in starts[1:]), length]  # a window contributes its middle
-        impute, parts = super().impute, []
-        for start, low, high in zip(starts, ends, ends[1:], strict=False):
-            part = impute(_steps(values, slice(start, start + window)), samples, **options)[WHOLE]
-            parts.append(part[:, :, low - start : high - start])
-        return {WHOLE: torch.cat(parts, 2)}
+        ends = [*(start + window // 4 for start in starts[1:]), length]  # a window contributes its middle
+        for start, end in zip(starts, ends, strict=True):
+            part = super().impute(_steps(filled, slice(start, start + window)), 1, **options)[WHOLE][0]
+            filled[WHOLE][:, start:end] = part[:, : end - start]
+            filled.mask()[:, start:end] = True
+        return {WHOLE: filled[WHOLE].unflatten(0, (samples, count))}
 
 
 def _steps(values: Batch, steps: slice) -> Batch:

@@ -1,6 +1,7 @@
 """Diffusion and flow matching: exact statements with the optimal denoiser of normal data, and the model contract."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -88,19 +89,39 @@ def test_pure_noise_is_no_data_in_single_precision():
     assert embed_level(module.angle(torch.zeros(1, 1)))[0, 0] < 0 < embed_level(angle)[0, 0]
 
 
-def test_the_second_order_sampler_converges_faster_than_ddim():
+@pytest.mark.parametrize(("spec", "second_order"), [(Diffusion(), ("dpm", "heun")), (FlowMatching(), ("heun",))])
+def test_second_order_samplers_converge_faster_than_ddim(spec, second_order):
     noise = torch.randn(200, 2, dtype=torch.float64)
 
     def draws(sampler, steps):
-        module, parameters = build(FlowMatching(sampler=sampler, steps=steps))
+        module, parameters = build(replace(spec, sampler=sampler, steps=steps))
         return module.draw(parameters(200), noise)
 
     limit = draws("heun", 1000)
-    errors = {
-        sampler: [(draws(sampler, n) - limit).square().mean().sqrt() for n in (20, 40)] for sampler in ("ddim", "heun")
-    }
-    assert 1.6 < errors["ddim"][0] / errors["ddim"][1] < 2.5
-    assert errors["heun"][0] / errors["heun"][1] > 3
+    first, *others = (
+        [(draws(sampler, n) - limit).square().mean().sqrt() for n in (20, 40)] for sampler in ("ddim", *second_order)
+    )
+    assert 1.6 < first[0] / first[1] < 2.5
+    for errors in others:
+        assert errors[0] / errors[1] > 3
+
+
+@pytest.mark.parametrize("spec", [Diffusion(), FlowMatching(), Diffusion(steps=30)], ids=["40", "flow", "30"])
+def test_draws_of_an_exact_denoiser_have_the_deviation_of_the_data(spec):
+    """With a normal distribution as data, the best denoiser is known, and draws are linear in the noise."""
+    module = spec.build(Shape(5)).double()
+    scale = torch.tensor([0.1, 0.2, 0.3, 1.0, 3.0], dtype=torch.float64)
+
+    class Exact(torch.nn.Module):
+        def forward(self, z, angle, features):
+            return angle.sin() * angle.cos() * z * (1 - scale**2) / ((scale * angle.cos()) ** 2 + angle.sin() ** 2)
+
+    module.denoiser = Exact()
+    loc, one = torch.zeros(1, 5, dtype=torch.float64), torch.ones(1, 5, dtype=torch.float64)
+    start = module.sampler_angles(torch.ones((), dtype=torch.float64))
+    noise = ((scale * start.cos()) ** 2 + start.sin() ** 2).sqrt()[None]  # one deviation at the highest level
+    drawn = module.draw((loc, one, loc[:, :0]), noise)
+    torch.testing.assert_close(drawn, scale[None], rtol=0.035, atol=0)
 
 
 def test_without_a_denoiser_it_is_a_normal_distribution():
@@ -514,7 +535,7 @@ def test_a_loss_is_an_energy_and_has_no_bound():
         (lambda: Diffusion(log_snr=(3.0, 1.0)).build(Shape(2)), "increasing"),
         (lambda: Diffusion(guidance=2.0).build(Shape(2, 1)), "set `drop` above 0"),
         (lambda: Diffusion(drop=0.1).build(Shape(2)), "no parents"),
-        (lambda: FlowMatching(sampler="ancestral").build(Shape(2)), "'ddim' or 'heun'"),
+        (lambda: FlowMatching(sampler="ancestral").build(Shape(2)), "'ddim', 'dpm' or 'heun'"),
         (lambda: Diffusion(denoiser=JOINT).build(Shape(2)), "denoiser=None"),
         (lambda: joint("p(x_t | x_{<t}, z_{<=t}) p(z_t)", "q(z_t | x_{1:T})", COSINE), "basis=None"),
         (lambda: Product([((0,), FlowMatching()), ((1,), Normal())]).build(Shape(2)), "no density"),
@@ -522,6 +543,11 @@ def test_a_loss_is_an_energy_and_has_no_bound():
         (lambda: joint("p(x_t | x_{<t}, z_t) p(z_t)", "q(z_t | x_{1:T})"), "needs a factor such as"),
         (lambda: joint("p(z) p(x_t | z)", "q(z | x_{1:T})", {"q(z)": Diffusion()}), "bound in place of a density"),
         (lambda: joint("p(z) p(x_t | z)", "q(z | x_{1:T})", {"p(z)": FlowMatching()}), "loss in place of a density"),
+        (
+            lambda: switching(Diffusion()),
+            r"p\(x_t \| k_t\) has a bound in place of a density, so k cannot be summed out",
+        ),
+        (lambda: switching(FlowMatching()), "loss in place of a density, so k cannot be summed out"),
     ],
 )
 def test_mistakes_are_refused(build, message):
@@ -548,3 +574,8 @@ def test_one_diffusion_is_the_prior_of_a_latent_sequence():
 def joint(generative, inference, distributions=None):
     distributions = distributions or {"p(x)": Diffusion(denoiser=JOINT)}
     return dvae.DynamicalVAE(generative, inference, {"x": 2, "z": 1}, distributions=distributions)
+
+
+def switching(emission):
+    sizes = {"k": dvae.Discrete(2), "x": 1}
+    return dvae.DynamicalVAE("p(k_t | k_{t-1}) p(x_t | k_t)", "", sizes, distributions={"p(x)": emission})

@@ -186,6 +186,7 @@ def forecasts(times=None, calendar=NUMBERS, samples=50):
     draws = rng.normal(1e6, 1, size=(samples, 2, 3, 2)).astype(np.float32)
     draws[..., 1] = rng.integers(0, 2, draws.shape[:-1])
     past, truth = rng.normal(size=(2, 4, 2)), rng.normal(size=(2, 3, 2))
+    past[..., 1], truth[..., 1] = past[..., 1] > 0, truth[..., 1] > 0
     truth[0, 1, 0] = past[1, 2, 0] = NAN
     return PanelForecasts(draws, past, truth, {"y": "m", "open": ""}, [("a", 4), ("b", 9)], times, calendar)
 
@@ -276,6 +277,21 @@ def test_prediction_bands_are_the_quantiles():
     if not find_spec("pyarrow"):
         with pytest.raises(ValueError, match="needs pyarrow: pip install"):
             result.save("a.parquet")
+
+
+def test_rare_counts_are_drawn_as_counts():
+    """Draws that are 0 or 1 by chance are no shares if the past or the truth has other values."""
+    result = forecasts()
+    arrays = {name: getattr(result, name)[..., 1:] for name in ("draws", "past", "truth")}
+    for name in ("past", "truth"):
+        values = arrays[name] + 3.0
+        figure = replace(result, columns={"claims": ""}, **arrays | {name: values}).plot(1)
+        (axis,) = figure.axes
+        assert axis.get_ylabel() == ""
+        assert axis.get_ylim()[1] > values[1].max()
+        assert "median" in [text.get_text() for text in figure.legends[0].get_texts()]
+    labels = [text.get_text() for text in result.plot(1).legends[0].get_texts()]
+    assert {"median", "share of draws", "truth"} <= {*labels}
 
 
 @pytest.fixture(scope="module")

@@ -35,8 +35,9 @@ def enclosed_volume(vertices: Tensor, faces: Tensor) -> Tensor:
         faces: (F, 3), vertex indices of triangles, counterclockwise from outside.
 
     Returns:
-        Volumes (...,): the sum of the signed tetrahedra between the origin and the triangles. For a closed surface it
-        does not depend on the origin.
+        Volumes (...,): the sum of the signed tetrahedra between the first vertex and the triangles. For a closed
+        surface it does not depend on this vertex.
     """
+    vertices = vertices - vertices[..., :1, :]
     first, second, third = (vertices[..., corner, :] for corner in faces.unbind(-1))
     return (first * second.cross(third, dim=-1)).sum((-2, -1)) / 6

@@ -28,6 +28,9 @@ MOST_VERTICES = 2**17
 FURTHEST = 1e3
 """Maximum absolute value in an array; positions in metres and weights are far smaller."""
 
+SMPLX_JOINTS = 55
+"""Number of joints of SMPL-X, whose expressions follow the shape parameters in `shapedirs`."""
+
 _MEMBERS: dict[str, tuple[str | int, ...]] = {  # member -> its axes: vertices, shape parameters, joints, faces
     "v_template": ("V", 3),
     "shapedirs": ("V", 3, "S"),
@@ -46,7 +49,8 @@ def read_body(path: str | os.PathLike[str], shapes: int = 8) -> Body:
 
     Args:
         path: npz file of the model.
-        shapes: number of shape parameters S; the first S of the file are used.
+        shapes: number of shape parameters S; the first S of the file are used. A file of SMPL-X has 300 if it has 400
+            columns, and otherwise 10; the others are expressions.
 
     Returns:
         Body with 22 joints and S shape parameters.
@@ -134,9 +138,11 @@ def _defect(arrays: dict[str, np.ndarray], shapes: int) -> str:
             return f"{name} has values that are NaN or above {FURTHEST:g} in absolute value"
     if sizes["V"] > MOST_VERTICES:
         return f"it has {sizes['V']:,} vertices; a body has at most {MOST_VERTICES:,}"
-    if not 1 <= shapes <= sizes["S"]:
-        return f"it has {sizes['S']} shape parameters, so `shapes` must be from 1 to {sizes['S']}, got {shapes}"
-    parents = arrays["kintree_table"][0].astype(np.int64)
+    parents, most = arrays["kintree_table"][0].astype(np.int64), sizes["S"]
+    if len(parents) == SMPLX_JOINTS:  # as the public package `smplx` reads them
+        most = min(most, 300 if most >= 400 else 10)
+    if not 1 <= shapes <= most:
+        return f"it has {most} shape parameters, so `shapes` must be from 1 to {most}, got {shapes}"
     if tuple(parents[1 : len(JOINTS)]) != PARENTS[1:] or not (parents[1:] < np.arange(1, len(parents))).all():
         return f"kintree_table is not SMPL's joint tree, whose first joints are {', '.join(JOINTS)}"
     if (parents[1:] < 0).any() or arrays["f"].min() < 0 or arrays["f"].max() >= sizes["V"]:
@@ -144,4 +150,6 @@ def _defect(arrays: dict[str, np.ndarray], shapes: int) -> str:
     for name in ("weights", "J_regressor"):
         if not np.allclose(arrays[name].astype(np.float64).sum(1), 1, atol=1e-3):
             return f"each row of {name} must sum to 1, but some rows do not"
+    if arrays["weights"].min() < 0:
+        return f"skinning weights must be at least 0, but the smallest is {arrays['weights'].min():g}"
     return ""

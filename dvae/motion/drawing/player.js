@@ -14,14 +14,14 @@ const unpacked = async text => {
   return whole;
 };
 
-// Coordinates were stored as steps from the frame before; a person's first future frame follows the last observed one.
+// Coordinates were stored as steps from the frame before; a person's first future frame follows the last observed one, if any.
 const opened = async scene => {
   const values = await unpacked(scene.packed), size = 3 * scene.joints, first = size * scene.observed;
   for (let i = size; i < first; i++) values[i] += values[i - size];
   const people = [];
   let start = first;
   for (const person of scene.people) {
-    for (let i = 0; i < size * person.frames; i++)
+    for (let i = first ? 0 : size; i < size * person.frames; i++)
       values[start + i] += values[i < size ? first - size + i : start + i - size];
     people.push({...person, start});
     start += size * person.frames;
@@ -63,7 +63,7 @@ const play = async controls => {
     }
     stages.forEach((stage, n) => drawStage(stage, scenes[n], columns, scale, up));
     slider.value = frame;
-    const seconds = (frame - observed + 1) * milliseconds / 1000;
+    const seconds = (frame - Math.max(observed, 1) + 1) * milliseconds / 1000;
     time.textContent = slider.ariaValueText = `${seconds < 0 ? '−' : '+'}${Math.abs(seconds).toFixed(2)} s`;
   };
 
@@ -93,7 +93,7 @@ const play = async controls => {
       pen.stroke();
       pen.fillStyle = '#57606a';
       pen.fillText(person.name, x0, Math.floor(k / columns) * h + NAME - 4);
-      if (after >= observed + person.frames) return;  // a truth that ends early
+      if (after >= observed + person.frames) return;  // a motion that ends early
       const [a, b] = [at(person, before), at(person, after)];
       const joint = j => {
         if (values[a + 3 * j] === MISSING || values[b + 3 * j] === MISSING) return null;
@@ -126,7 +126,8 @@ const play = async controls => {
     stop();
     scenes = await Promise.all(stages.map(stage => opened(stage.scenes[select.value])));
     view = together();
-    slider.max = frame = view.frames - 1;
+    slider.max = view.frames - 1;
+    frame = view.observed ? view.frames - 1 : 0;
     draw();
     controls.dataset.frames = view.frames;
   };

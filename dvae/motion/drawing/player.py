@@ -29,7 +29,7 @@ from PIL import Image
 
 from ... import files
 from ..geometry.skeleton import Skeleton
-from .plot import FIXED, PAST, SPACING, Scene, make_scene
+from .plot import FIXED, PAST, SPACING, Scene, centres, make_scene
 
 SCRIPT = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
 """Script of a page with players: controls, and stages that they move together."""
@@ -91,7 +91,7 @@ def _scene(scene: Scene) -> dict[str, Any]:
     ends = [np.flatnonzero((ahead != MISSING).any((1, 2))).max(initial=-1) + 1 for ahead in future]
     futures = [ahead[:end] for ahead, end in zip(future, ends, strict=True)]
     pieces = [np.diff(past[0], axis=0, prepend=0)]
-    pieces += [np.diff(ahead, axis=0, prepend=past[0, -1:]) for ahead in futures]
+    pieces += [np.diff(ahead, axis=0, prepend=past[0, -1:] if observed else 0) for ahead in futures]
     middle = (low + high) / 2
     return {
         "joints": scene.skeleton.joints,
@@ -152,14 +152,14 @@ class Animation:
             file.write(self.to_html().encode())
 
     def to_gif(self) -> bytes:
-        """Return a GIF that repeats the motion at original speed, in at most `FRAMES` pictures.
+        """Return a GIF that repeats the motion at original speed, in at most `FRAMES` pictures of at least 20 ms.
 
         All people stay in their places: every pose is drawn relative to its pelvis, seen from the front.
         """
         scene = self.scene
         every = ceil(len(scene.frames) / FRAMES)
         motion = scene.motion[:, scene.frames][:, ::every][..., [0, 2]]
-        motion = motion - motion[..., scene.skeleton.root, None, :] * [1, 0]
+        motion = motion - centres(scene.skeleton, motion) * [1, 0]
         low, high = (find(motion, axis=(0, 1, 2)) for find in (np.nanmin, np.nanmax))
         step = [max(SPACING, high[0] - low[0] + 0.2), high[1] - low[1] + 0.4]
         rows = ceil(len(motion) / ACROSS)
@@ -170,7 +170,7 @@ class Animation:
         figure = Figure(figsize=(width / 72, width * rows * step[1] / corner / 72), dpi=72)
         ax = figure.add_axes((0, 0, 1, 1), xlim=(low[0] - 0.1, low[0] - 0.1 + corner), ylim=(top - rows * step[1], top))
         ax.set_axis_off()
-        edges = np.array(scene.skeleton.edges)
+        edges = np.array(scene.skeleton.edges, int).reshape(-1, 2)
         people = [LineCollection([], capstyle="round") for _ in places]
         for lines, name, place in zip(people, scene.names, places, strict=True):
             ax.add_collection(lines)
@@ -192,8 +192,9 @@ class Animation:
             Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures
         )
         file = io.BytesIO()
-        duration = max(20, round(every * scene.milliseconds, -1))  # in steps of 10 ms; browsers slow down faster ones
-        first.save(file, "gif", save_all=True, append_images=others, duration=duration, loop=0)
+        ends = np.round(np.arange(len(pictures) + 1) * every * scene.milliseconds, -1)  # a GIF counts 10 ms
+        durations = np.diff(ends).clip(20).astype(int).tolist()  # browsers slow down faster ones
+        first.save(file, "gif", save_all=True, append_images=others, duration=durations, loop=0)
         return file.getvalue()
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
@@ -249,9 +250,10 @@ def animate(
 
     Args:
         skeleton: skeleton of the poses.
-        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth.
-        samples: (K, H, J, 3) in metres. Without samples, only the observed motion is shown, and time zero is its first
-            pose.
+        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth. With O = 0, people
+            share no past, and time zero is their first pose.
+        samples: (K, H, J, 3) in metres. Without samples, the observed motion is shown, without a past. Without a past,
+            joints may be NaN, and all are after the end of a shorter motion.
         truth: (F, J, 3) in metres, if known; F is at most H.
         names: names of the K samples; default: numbers.
         fixed: joints that move in the same way in all samples; bones that end in them are dark and thick.

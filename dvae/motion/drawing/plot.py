@@ -102,6 +102,8 @@ def futures(
         ValueError: the shapes do not match each other or the skeleton, or are empty.
     """
     past, future, real = _as_arrays(skeleton, observed, samples, truth)
+    if not len(past):
+        raise ValueError("observed has no frame; `futures` draws at least one")
     crosses = _path_array(paths or {}, skeleton, future.shape[1])
     azimuth = view - final_heading(skeleton, torch.from_numpy(past))
     now, horizon = len(past) - 1, future.shape[1]
@@ -113,11 +115,11 @@ def futures(
         )
         ax = figure.subplots()
 
-    middle = future[:, :, skeleton.root].mean(0)
+    middle, digits = future[:, :, skeleton.root].mean(0), 1 if horizon >= frames * skeleton.fps / 10 else 2
 
     def draw(poses: np.ndarray, column: int, **line: Any) -> None:
         is_shared = len(crosses) and columns[column] > now
-        origin = middle[columns[column] - now - 1] if is_shared else poses[..., skeleton.root : skeleton.root + 1, :]
+        origin = middle[columns[column] - now - 1] if is_shared else centres(skeleton, poses)
         pose(ax, poses - origin, skeleton, offset=(column * SPACING, 0.0), azimuth=azimuth, **line)
 
     colours = _colours(len(future)).repeat(len(skeleton.edges), axis=0)
@@ -136,7 +138,7 @@ def futures(
 
     hide_axes(ax)
     seconds = [(frame - now) / skeleton.fps for frame in columns]
-    ax.set_xticks(SPACING * np.arange(len(columns)), [f"{s:+.1f} s" if s else "0 s" for s in seconds])
+    ax.set_xticks(SPACING * np.arange(len(columns)), [f"{s:+.{digits}f} s" if s else "0 s" for s in seconds])
     _add_legend(ax, len(future), real is not None, len(crosses) > 0)
     return ax
 
@@ -151,7 +153,7 @@ class Scene:
         colours: colour of each person after frame `now`.
         motion: (P, O + H, J, 3) in metres, without the offsets of `places`; NaN after the end of a truth that ends
             early.
-        now: index of the last observed frame.
+        now: index of the last observed frame; -1 if people share no past.
         frames: indices of the frames to show, including `now`.
         fixed: joints that move in the same way in all samples.
         truth: whether the truth is included.
@@ -187,8 +189,8 @@ class Scene:
         return 1000 * self.frames.step / self.skeleton.fps
 
     def seconds(self, frame: int) -> float:
-        """Return the time in seconds of a frame relative to the last observed frame."""
-        return (frame - self.now) / self.skeleton.fps
+        """Return the time in seconds of a frame relative to the last observed frame, or else to the first."""
+        return (frame - max(self.now, 0)) / self.skeleton.fps
 
     def shared(self, person: int) -> frozenset[int]:
         """Return the joints of a person that move in the same way in all samples; none for the truth."""
@@ -210,8 +212,10 @@ def make_scene(
 
     Args:
         skeleton: skeleton of the poses.
-        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing.
-        samples: (K, H, J, 3) in metres; None to draw only the observed motion, with time zero at its first pose.
+        observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing. With O = 0, people share no past,
+            and time zero is their first pose.
+        samples: (K, H, J, 3) in metres; None to draw the observed motion without a past. Without a past, joints may be
+            NaN, and all are after the end of a shorter motion.
         truth: (F, J, 3) in metres with F at most H, NaN where a joint is missing; None if unknown.
         names: names of the K samples; numbers by default.
         fixed: indices of joints that move in the same way in all samples.
@@ -222,11 +226,11 @@ def make_scene(
         ValueError: the shapes do not match each other or the skeleton, an array is empty, a position is not finite, or
             `names`, `fixed` or `every` do not match the motion.
     """
-    only_observed = samples is None
-    if only_observed:
+    if samples is None:
         motion = np.asarray(observed)
-        observed, samples, names = motion[:1], motion[None, 1:], names or [""]
+        observed, samples, names = motion[:0], motion[None], names or [""]
     past, future, real = _as_arrays(skeleton, observed, samples, truth)
+    has_past = len(past) > 0
     fixed_joints = frozenset(map(int, fixed))
     names = names or [f"sample {k + 1}" for k in range(len(future))]
     every = max(1, round(skeleton.fps / 25)) if every is None else every
@@ -236,8 +240,8 @@ def make_scene(
         raise ValueError(f"fixed has joints {sorted(unknown)}; expected indices from 0 to {skeleton.joints - 1}")
     if every < 1:
         raise ValueError(f"every is {every}; expected 1 to draw each frame, 2 to draw every second one, and so on")
-    arrays = [array for array in (past, real, future if only_observed else None) if array is not None]
-    if not (only_observed or np.isfinite(future).all()) or any(np.isinf(positions).any() for positions in arrays):
+    arrays = [array for array in (past, real, future) if array is not None]
+    if (has_past and np.isnan(future).any()) or any(np.isinf(positions).any() for positions in arrays):
         raise ValueError("observed, samples or truth have NaN or infinite positions, which cannot be drawn")
     people = list(zip(names, map(to_hex, _colours(len(future))), future, strict=True))
     if real is not None:
@@ -245,7 +249,7 @@ def make_scene(
     labels, colours, aheads = map(list, zip(*people, strict=True))
     motion = _to_viewer(skeleton, past, aheads, future.shape[1], view)
     now = len(past) - 1
-    shown_frames = range(now % every, motion.shape[1], every)
+    shown_frames = range(max(now, 0) % every, motion.shape[1], every)
     return Scene(skeleton, labels, colours, motion, now, shown_frames, fixed_joints, real is not None)
 
 
@@ -282,9 +286,17 @@ def _to_viewer(
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
     for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which is not drawn
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
-    turn = torch.tensor(view - final_heading(skeleton, torch.from_numpy(past)), dtype=torch.float64)
+    start = motion[0, : max(len(past), 1)]
+    turn = torch.tensor(view - final_heading(skeleton, torch.from_numpy(start)), dtype=torch.float64)
     motion = rotate_about_up(torch.from_numpy(motion), turn, skeleton.up).numpy()
     return motion if skeleton.up == "z" else motion[..., [0, 2, 1]] * [1, -1, 1]
+
+
+def centres(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:
+    """Return the root of poses (..., J, C) as (..., 1, C), or the mean of the known joints where it is missing."""
+    known, root = np.isfinite(poses), poses[..., skeleton.root : skeleton.root + 1, :]
+    mean = np.where(known, poses, 0.0).sum(-2, keepdims=True) / known.sum(-2, keepdims=True).clip(1)
+    return np.where(np.isfinite(root), root, mean)
 
 
 def _places(people: int, step: np.ndarray) -> np.ndarray:
@@ -326,7 +338,7 @@ def _as_arrays(
     joint = (skeleton.joints, 3)
     samples_fit = past.ndim == 3 and past.shape[1:] == joint and future.ndim == 4 and future.shape[2:] == joint
     truth_fits = real is None or (real.ndim == 3 and real.shape[1:] == joint and len(real) <= future.shape[1])
-    if not (samples_fit and truth_fits and past.size and future.size):
+    if not (samples_fit and truth_fits and future.size):
         raise ValueError(
             f"expected observed (O, J, 3), samples (K, H, J, 3) and truth (F, J, 3) with J = {joint[0]} and F at most "
             f"H, got {past.shape}, {future.shape} and {None if real is None else real.shape}"
@@ -349,8 +361,11 @@ def surfaces(faces: Any, vertices: Any, *, names: Sequence[str] = (), up: str = 
         A figure whose axes are in metres.
 
     Raises:
-        ValueError: the shapes do not match each other, a position is not finite, or the number of names is wrong.
+        ValueError: the shapes do not match each other, a position is not finite, the number of names is wrong, or `up`
+            is another axis.
     """
+    if up not in ("y", "z"):
+        raise ValueError(f'up is {up!r}; expected "y" or "z"')
     corners, people = np.asarray(faces), np.asarray(vertices, np.float64)
     people = people[None] if people.ndim == 2 else people
     names = names or [""] * len(people)

@@ -294,11 +294,11 @@ class Skeleton:
                 f"positions have shape {tuple(positions.shape)}, expected (..., {self.joints}, 3) for "
                 f"skeleton {self.name!r}"
             )
-        parents, children = zip(*self.edges, strict=True)
+        parents, children = ([edge[end] for edge in self.edges] for end in (0, 1))
         if isinstance(positions, Tensor):
             ends = [positions.index_select(-2, indices(joints, positions)) for joints in (children, parents)]
         else:
-            ends = [positions[..., list(joints), :] for joints in (children, parents)]
+            ends = [positions[..., joints, :] for joints in (children, parents)]
         return ((ends[0] - ends[1]) ** 2).sum(-1) ** 0.5
 
     def limbs(self, poses: Tensor) -> Tensor:

@@ -429,7 +429,7 @@ def _rotating(motion: MotionSet) -> tuple[str, ...]:
 def resting_offsets(motion: MotionSet) -> Tensor:
     """Return mean offsets of joints from their parents, in the coordinates of the parents, (B, J, 3) in metres."""
     skeleton = motion.skeleton
-    parents, children = (list(ends) for ends in zip(*skeleton.edges, strict=True))
+    parents, children = ([edge[end] for edge in skeleton.edges] for end in (0, 1))
     offsets = torch.zeros(len(motion), skeleton.joints, 3, dtype=torch.float64)
     for rows, quaternions, positions in _of_one_length(motion):
         local = to_matrix(quaternions, "quaternion")

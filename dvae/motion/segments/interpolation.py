@@ -205,7 +205,8 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
         A matplotlib figure.
 
     Raises:
-        ValueError: there are too few segments, the number of labels is wrong, or there are too many distinct labels.
+        ValueError: there are too few segments, the number of labels is wrong, there are too many distinct labels, or z
+            has one number.
     """
     with seeded_evaluation(model, 0):
         means = model.encode(on_device_of(model, batch)).double().cpu()
@@ -213,6 +214,8 @@ def latent_map(model: Any, batch: Mapping[str, Any], labels: Sequence[str]) -> F
         raise ValueError(
             f"expected at least 3 segments and a label for each, got {len(means)} segments and {len(labels)} labels"
         )
+    if means.shape[1] < 2:
+        raise ValueError("z has one number; a map needs at least two")
     names = list(dict.fromkeys(labels))
     if len(names) > 10 * len(MARKERS):
         raise ValueError(

@@ -174,7 +174,7 @@ def test_draws_have_the_conditional_mean_and_variance_of_normal_data():
     normal = MultivariateNormal(torch.zeros(length).double(), covariance)
     options = {"steps": 400, "batch_size": 128, "learning_rate": 5e-3, "decay": 0.05}
     x = normal.sample((3000,))[..., None].float()
-    fit = dvae.fit(small(width=32, sampler_steps=15), x, **options, progress=False, accelerator="cpu")
+    fit = dvae.fit(small(width=32, sampler_steps=30), x, **options, progress=False, accelerator="cpu")
     test = normal.sample((30,))[..., None].float()
     mask = torch.rand(30, length, 1) < 0.5
     mask[:10, :, 0], mask[10:, 2] = steps < 2, False
@@ -189,6 +189,15 @@ def test_draws_have_the_conditional_mean_and_variance_of_normal_data():
     assert torch.cat(errors).square().mean().sqrt() < 0.25  # 0.05 are Monte Carlo errors
     assert torch.cat(ratios).mean() == pytest.approx(1.0, abs=0.1)
     assert (torch.cat(ratios) - 1).square().mean().sqrt() < 0.2
+    # draws of a long gap continue from window to window, here between steps 3 and 4, and 5 and 6
+    steps = torch.arange(10)
+    long = MultivariateNormal(torch.zeros(10).double(), 0.8 ** (steps[:, None] - steps).abs().double())
+    gap = torch.ones(30, 10, 1, dtype=torch.bool)
+    gap[:, 2:8] = False
+    filled = fit.model.impute({"x": long.sample((30,))[..., None].float(), "mask": gap}, samples=200)["x"][..., 2:8, 0]
+    residuals = (filled - filled.mean(0)).flatten(0, 1)
+    correlations = torch.corrcoef(residuals.mT).diagonal(1)[[1, 3]]
+    assert ((correlations > 0.45) & (correlations < 0.9)).all()
 
 
 @pytest.mark.parametrize("units", ["logs", "series"])

@@ -197,6 +197,15 @@ def test_ragged_and_missing_data_start_at_the_states(race):
     assert accuracy_after_start(model, {"x": padded, "mask": mask, "lengths": lengths}, states) >= 0.9
 
 
+def test_a_column_that_some_sequences_never_observe_is_no_state(race):
+    _, x, states = race
+    mask = torch.ones_like(x, dtype=torch.bool)
+    mask[:10, :, 0] = False
+    torch.manual_seed(0)
+    model = dvae.method("rslds").build({"x": 10})
+    assert accuracy_after_start(model, {"x": x + 30, "mask": mask}, states) >= 0.9
+
+
 class Counts(Schema):
     """Schema of counts."""
 

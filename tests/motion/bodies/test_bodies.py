@@ -147,7 +147,8 @@ def test_the_volume_and_vertex_error_of_a_moved_cube():
     squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = torch.tensor([[a, *rest] for a, b, c, d in squares for rest in ((b, c), (c, d))])
     assert enclosed_volume(corners, faces) == 8
-    torch.testing.assert_close(enclosed_volume(corners + torch.tensor([5.0, -7.0, 3.0]), faces), torch.tensor(8.0))
+    for moved in (torch.tensor([5.0, -7.0, 3.0]), torch.tensor(100.0)):
+        torch.testing.assert_close(enclosed_volume(corners + moved, faces), torch.tensor(8.0))
     frames = corners.repeat(2, 3, 1, 1)  # two sequences of three frames
     translated = frames.clone()
     translated[0, 0] += torch.tensor([0.3, 0.4, 0.0])
@@ -202,6 +203,22 @@ def test_hands_without_rotations_move_with_the_wrist(tmp_path):
         torch.testing.assert_close(getattr(body, name), tensor)
 
 
+@pytest.mark.parametrize(("columns", "most"), [(20, 10), (400, 300)])
+def test_expressions_of_smplx_are_not_shape_parameters(tmp_path, columns, most):
+    members, extra = arrays(human()), 55 - 22
+    for name, axis in (("weights", 1), ("J_regressor", 0)):
+        members[name] = np.concatenate(
+            [members[name], np.zeros_like(members[name].take(range(1), axis).repeat(extra, axis))], axis
+        )
+    members["J_regressor"][22:, 0] = 1
+    members["kintree_table"] = np.concatenate([members["kintree_table"], [[15] * extra, [*range(22, 55)]]], 1)
+    members["shapedirs"] = np.zeros((len(members["v_template"]), 3, columns), np.float32)
+    np.savez(tmp_path / "body.npz", **members)
+    assert read_body(tmp_path / "body.npz", most).parameters_of_shape == most
+    with pytest.raises(ValueError, match=f"it has {most} shape parameters, so `shapes` must be from 1 to {most}"):
+        read_body(tmp_path / "body.npz", most + 1)
+
+
 def changed(name, change):
     return lambda members: members.update({name: change(members[name])})
 
@@ -216,6 +233,10 @@ def changed(name, change):
         (changed("f", lambda a: a - 1), "refers to an index that does not exist"),
         (changed("f", lambda a: a.astype(float)), "expected whole numbers"),
         (changed("weights", lambda a: 2 * a), "each row of weights must sum to 1"),
+        (
+            changed("weights", lambda a: a + np.float32(0.1) * (np.eye(22)[0] - np.eye(22)[1])),
+            "at least 0, but the small",
+        ),
         (changed("J_regressor", lambda a: np.array({"sparse": 1})), "pickled objects"),
         (changed("kintree_table", lambda a: a[:, ::-1]), "kintree_table is not SMPL's joint tree"),
         (changed("kintree_table", lambda a: a[:, :5]), "expected whole numbers"),

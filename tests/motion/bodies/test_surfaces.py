@@ -33,6 +33,8 @@ def test_bodies_are_drawn_side_by_side_upright_and_facing_the_viewer(up):
         surfaces(PERSON.faces, people, names=list("abcd"))
     with pytest.raises(ValueError, match="a face refers to vertex"):
         surfaces(PERSON.faces, people[:, :9])
+    with pytest.raises(ValueError, match='up is \'x\'; expected "y" or "z"'):
+        surfaces(PERSON.faces, people, up="x")
 
 
 def test_visible_triangles_are_drawn_from_back_to_front():

@@ -17,7 +17,7 @@ from dvae import motion
 from dvae.cli import main
 from dvae.motion.drawing.player import animate
 from dvae.motion.drawing.plot import PAST, TRUTH
-from dvae.motion.geometry.skeleton import HUMAN36M, WALKER, rotate_about_up
+from dvae.motion.geometry.skeleton import HUMAN36M, WALKER, Skeleton, rotate_about_up
 
 NOW, HORIZON = 5, 6
 MILLIMETRE = 1e-3
@@ -83,9 +83,39 @@ def test_skipping_frames_keeps_the_present_and_the_speed(bodies):
     assert scene_of(fast, *bodies)["milliseconds"] == pytest.approx(40)
 
 
+def test_people_without_a_past_have_their_own_first_pose_and_their_own_end(bodies):
+    _, samples, truth = bodies
+    ends = [HORIZON, 2, 4]
+    padded = samples.copy()
+    for ahead, end in zip(padded, ends, strict=True):
+        ahead[end:] = np.nan
+    scene = scene_of(WALKER, samples[0, :0], padded, truth[:3], every=1, view=0.3)
+    assert (scene["observed"], scene["frames"]) == (0, HORIZON)
+    assert [person["frames"] for person in scene["people"]] == [3, *ends]
+    expected = np.full((4, *samples.shape[1:]), np.nan)
+    expected[0, :3], expected[1:] = truth[:3], padded
+    np.testing.assert_allclose(unpacked(scene), project(WALKER, expected, truth[0], 0.3), atol=MILLIMETRE)
+    film = animate(WALKER, samples[0, :0], padded)
+    assert film.scene.seconds(0) == 0
+    assert film.to_gif()
+    assert scene_of(WALKER, truth[:1])["frames"] == 1  # a single pose
+
+
+def test_a_person_with_a_missing_root_and_one_of_a_single_joint_are_drawn(bodies):
+    motion_without_root = bodies[0].copy()
+    motion_without_root[:, WALKER.root] = np.nan
+    point = Skeleton(("a",), (-1,))
+    for film in (animate(WALKER, motion_without_root), animate(point, np.zeros((3, 1, 3)))):
+        with Image.open(io.BytesIO(film.to_gif())) as picture:
+            assert picture.n_frames
+    pixels = np.asarray(Image.open(io.BytesIO(animate(WALKER, motion_without_root).to_gif())).convert("L"))
+    assert (pixels < 200).sum() > 100
+    assert point.bone_lengths(np.zeros((3, 1, 3))).shape == (3, 0)
+
+
 def test_mismatched_arrays_are_errors(bodies):
     observed, samples, truth = bodies
-    for wrong in ((observed[..., :2], samples, truth), (observed, samples[:, :3], truth), (observed[:1],)):
+    for wrong in ((observed[..., :2], samples, truth), (observed, samples[:, :3], truth), (observed[:0],)):
         with pytest.raises(ValueError, match=r"expected observed \(O, J, 3\), samples"):
             animate(WALKER, *wrong)
     with pytest.raises(ValueError, match="NaN or infinite"):
@@ -106,10 +136,11 @@ def test_the_page_needs_no_network_and_escapes_its_title(bodies, tmp_path, title
     assert "http" not in re.sub("(?s)<script>.*", "", page).replace("http-equiv", "")
 
 
-@pytest.mark.parametrize("frames", [1, 50])
-def test_a_notebook_shows_a_gif_at_original_speed(bodies, frames):
+@pytest.mark.parametrize(("frames", "fps"), [(1, 30.0), (1, 28.0), (1, 45.0), (50, 30.0)])
+def test_a_notebook_shows_a_gif_at_original_speed(bodies, frames, fps):
     observed, samples, truth = bodies
-    film = animate(WALKER, observed, samples.repeat(frames, 1), truth, fixed=[1, 2], title='"<b>')
+    walker = replace(WALKER, fps=fps)
+    film = animate(walker, observed, samples.repeat(frames, 1), truth, fixed=[1, 2], title='"<b>', every=1)
     html_of_film = film._repr_mimebundle_()["text/html"]
     assert "<b>" not in html_of_film
     gif = base64.b64decode(re.search('src="data:image/gif;base64,([^"]*)"', html_of_film)[1])
@@ -121,7 +152,9 @@ def test_a_notebook_shows_a_gif_at_original_speed(bodies, frames):
             picture.seek(frame)
             seconds += picture.info["duration"] / 1000
         assert picture.info["loop"] == 0  # without end
-        assert seconds == pytest.approx((NOW + HORIZON * frames) / WALKER.fps, rel=0.15)
+        length = NOW + HORIZON * frames
+        every = -(-length // 40)
+        assert seconds == pytest.approx(-(-length // every) * every / fps, abs=0.006)
 
 
 def test_the_colours_of_a_gif_follow_the_observed_frames(bodies):

@@ -90,3 +90,5 @@ def test_a_map_shows_labels_and_explained_variance(segments, model):
     assert n_points == len(segments)
     with pytest.raises(ValueError, match="at least 3 segments and a label for each, got 4 segments and 2 labels"):
         latent_map(model, segments.all(), labels[:2])
+    with pytest.raises(ValueError, match="z has one number; a map needs at least two"):
+        latent_map(dvae.method("motion-latent", latent=1, widths=(4,)).build(segments.schema), segments.all(), labels)
