@@ -137,9 +137,11 @@ class External:
     given_root: Expert[Root | None] = None
 
     def check(self) -> None:
-        """Raise a `UsageError` if two files have the same name, or options for files have no file."""
+        """Raise a `UsageError` if two files have the same name, one is absent, or options for files have no file."""
         if len({path.stem for path in self.forecasts}) < len(self.forecasts):
             raise UsageError(f"--forecasts {' '.join(map(str, self.forecasts))}: give files with different names")
+        if absent := [str(path) for path in self.forecasts if not path.is_file()]:
+            raise UsageError(f"--forecasts {' '.join(absent)}: no such file")
         if not self.forecasts and self != External():
             raise UsageError("--protocol, --root, --axes, --unit and --given-root need --forecasts; leave them out")
 

@@ -250,7 +250,7 @@ class DenoisingModule(ConditionalDistribution):
     def draw(self, parameters: Parameters, noise: Tensor) -> Tensor:
         loc, scale, features, *steps = parameters
         spec, z = self.spec, noise
-        levels = self.sampler_angles(torch.linspace(1, 0, spec.steps + 1, dtype=loc.dtype, device=loc.device)).unbind()
+        levels = self.sampler_angles(torch.linspace(1, 0, spec.steps + 1, dtype=loc.dtype, device=loc.device))
 
         def denoised(z: Tensor, angle: Tensor) -> Tensor:
             angle = angle.expand(self._level_shape(z))
@@ -261,7 +261,7 @@ class DenoisingModule(ConditionalDistribution):
             return angle.cos() * z - angle.sin() * v
 
         earlier = torch.zeros_like(z)
-        for before, after, share in zip(levels, levels[1:], _extrapolation(torch.stack(levels)), strict=False):
+        for before, after, share in zip(levels[:-1], levels[1:], _extrapolation(levels), strict=True):
             u = denoised(z, before)
             if spec.sampler == "ancestral":
                 kept = (after.tan() / before.tan()).square()
@@ -572,7 +572,9 @@ def _extrapolation(levels: Tensor) -> Tensor:
     Args:
         levels: angles (steps + 1,), decreasing.
     """
-    drops = (levels.sin().log() - levels.cos().abs().log()).diff()  # of the log noise level, infinite at 0 and pi / 2
+    drops = (
+        levels.sin().log() - levels.cos().abs().log()
+    ).diff()  # of the log noise level: infinite at 0, large at pi / 2
     shares = functional.pad(drops[1:] / (2 * drops[:-1]), (1, 0))
     return torch.where(shares.isfinite(), shares, 0.0)
 

@@ -27,7 +27,7 @@ from typing_extensions import override
 
 from ...data.batch import WHOLE, Batch
 from ...data.schema import Schema, SchemaError
-from ...data.sequences import RandomGiven, interpolate_missing
+from ...data.sequences import RandomGiven, interpolate_missing, tensor_of
 from ...data.series_units import GivenUnits, SeriesUnits
 from ...data.units import Coordinate
 from ...data.views import Given, View, Views
@@ -40,6 +40,7 @@ from ...networks import Denoiser, Input, NetworkSpec, SelfAttention
 from ...networks.base import FixedLengthNetwork, aligned
 from ...options import Count, Layers, Range, Size
 from ...program.batch import AnyBatch
+from ...program.conditional import like
 from ...program.model import DynamicalVAE
 from ..method import LikelihoodMethod, columns_not_real
 
@@ -171,6 +172,7 @@ class CSDIModel(DynamicalVAE):
         past = _steps(values, slice(max(values[WHOLE].shape[1] + horizon - window, 0), None))
         return super().forecast(past, horizon, samples, **options)
 
+    @torch.no_grad()
     @override
     def impute(self, batch: AnyBatch, samples: int = 1, **options: Any) -> dict[str, Tensor]:
         """Fill in missing entries, in windows that overlap by half if a sequence is longer than a training window.
@@ -179,17 +181,19 @@ class CSDIModel(DynamicalVAE):
         """
         values = Batch(batch if isinstance(batch, Mapping) else {WHOLE: batch})
         length, window = values[WHOLE].shape[1], self.window
-        if window is None or length <= window or values.mask() is None:
+        if samples < 1 or window is None or length <= window or values.mask() is None:
             return super().impute(values, samples, **options)
         count = len(values[WHOLE])
-        filled = values.map(lambda value: value.repeat(samples, *[1] * (value.ndim - 1)))
+        filled = values.map(tensor_of).map(lambda value: value.repeat(samples, *[1] * (value.ndim - 1)))
+        if not filled[WHOLE].is_floating_point():
+            filled[WHOLE] = filled[WHOLE].to(like(self))
         starts = [*range(0, length - window, -(-window // 2)), length - window]
         ends = [*(start + window // 4 for start in starts[1:]), length]  # a window contributes its middle
         for start, end in zip(starts, ends, strict=True):
             part = super().impute(_steps(filled, slice(start, start + window)), 1, **options)[WHOLE][0]
             filled[WHOLE][:, start:end] = part[:, : end - start]
             filled.mask()[:, start:end] = True
-        return {WHOLE: filled[WHOLE].unflatten(0, (samples, count))}
+        return {WHOLE: filled[WHOLE].to(part).unflatten(0, (samples, count))}
 
 
 def _steps(values: Batch, steps: slice) -> Batch:

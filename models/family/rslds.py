@@ -246,7 +246,7 @@ def principal_path(model: DynamicalVAE, data: Batch, smoothing: int) -> tuple[Te
     seen = valid[..., None] if mask is None else mask & valid[..., None]
     mean = torch.where(seen, x, 0.0).sum((0, 1)) / seen.expand_as(x).sum((0, 1)).clamp(min=1)
     # a column that a sequence never observes is the mean
-    x = mean + interpolate_missing(x - mean, None if mask is None else seen)
+    x = mean + interpolate_missing(x - mean, seen)
     x = model.units[WHOLE](x) if WHOLE in model.units else x
     x = x.asinh() if model.generator[WHOLE].discrete else x
     rows = x[valid] - x[valid].mean(0)

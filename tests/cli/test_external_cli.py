@@ -94,7 +94,7 @@ def test_wrong_arguments_are_refused(capsys, folder, tmp_path):
         (["--forecasts", own, turned, *data(folder)], "give files with different names", 2),
         (["--forecasts", turned, *data(folder)], "samples have shape (2, 3), expected (K, N, T, D)", 2),
         (["--forecasts", turned, "--axes", "kx", *data(folder)], "axes are 'kx'", 2),
-        (["--forecasts", tmp_path / "absent.npz", *data(folder)], "absent.npz", 1),
+        (["--forecasts", tmp_path / "absent.npz", *data(folder)], "absent.npz: no such file", 2),
         (["--forecasts", own], "--forecasts needs --data, or runs", 2),
         (["--forecasts", own, *data(folder), "--unit", "mm"], "--unit and --given-root are for motion", 2),
         (["--forecasts", own, *data(folder), "--windows-of", "dlow"], "--windows-of is for motion", 2),

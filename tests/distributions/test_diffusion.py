@@ -10,7 +10,7 @@ from torch.distributions import MultivariateNormal
 
 import dvae
 from dvae.distributions import Diffusion, FlowMatching, Normal, Product, Shape
-from dvae.distributions.diffusion import embed_level
+from dvae.distributions.diffusion import _extrapolation, embed_level
 from dvae.inference.bounds.predictive import predictive_bound
 from dvae.networks import Attention, Denoiser, Recurrent, SelfAttention
 from dvae.networks.denoising import BASES
@@ -89,8 +89,18 @@ def test_pure_noise_is_no_data_in_single_precision():
     assert embed_level(module.angle(torch.zeros(1, 1)))[0, 0] < 0 < embed_level(angle)[0, 0]
 
 
-@pytest.mark.parametrize(("spec", "second_order"), [(Diffusion(), ("dpm", "heun")), (FlowMatching(), ("heun",))])
-def test_second_order_samplers_converge_faster_than_ddim(spec, second_order):
+def test_the_multistep_sampler_extrapolates_by_half_the_ratio_of_its_steps():
+    """Lu et al., 2022: D = u + (u - earlier) / (2 r) with r = h_{i-1} / h_i, the steps of log(cos / sin)."""
+    levels = torch.tensor([1.5, 1.2, 0.5, 0.4, 0.1], dtype=torch.float64)
+    signal = (levels.cos() / levels.sin()).log()
+    expected = [0.0] + [float((signal[i + 1] - signal[i]) / (signal[i] - signal[i - 1]) / 2) for i in (1, 2, 3)]
+    torch.testing.assert_close(_extrapolation(levels), torch.tensor(expected, dtype=torch.float64))
+    assert _extrapolation(torch.tensor([1.0, 0.5, 0.0]))[-1] == 0
+    assert _extrapolation(torch.tensor([1.0, 0.5])).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(("spec", "steps"), [(Diffusion(), (20, 40)), (FlowMatching(), (80, 160))])
+def test_second_order_samplers_converge_faster_than_ddim(spec, steps):
     noise = torch.randn(200, 2, dtype=torch.float64)
 
     def draws(sampler, steps):
@@ -99,7 +109,7 @@ def test_second_order_samplers_converge_faster_than_ddim(spec, second_order):
 
     limit = draws("heun", 1000)
     first, *others = (
-        [(draws(sampler, n) - limit).square().mean().sqrt() for n in (20, 40)] for sampler in ("ddim", *second_order)
+        [(draws(sampler, n) - limit).square().mean().sqrt() for n in steps] for sampler in ("ddim", "dpm", "heun")
     )
     assert 1.6 < first[0] / first[1] < 2.5
     for errors in others:

@@ -14,7 +14,7 @@ const unpacked = async text => {
   return whole;
 };
 
-// Coordinates were stored as steps from the frame before; a person's first future frame follows the last observed one, if any.
+// Coordinates were stored as steps from the frame before; a person's first future frame follows the last observed one.
 const opened = async scene => {
   const values = await unpacked(scene.packed), size = 3 * scene.joints, first = size * scene.observed;
   for (let i = size; i < first; i++) values[i] += values[i - size];

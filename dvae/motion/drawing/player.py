@@ -1,7 +1,8 @@
 """Interactive animations of skeletons in HTML pages and notebooks, small and without a library: play, seek, rotate.
 
 A scene is stored as integers in millimetres: the observed frames, which all people share, then the future of each
-person. Frames are stored as differences from the previous frame, and a missing joint has the coordinate `MISSING`.
+person. Frames are stored as differences from the previous frame, if any, and a missing joint has the coordinate
+`MISSING`.
 First all low bytes and then all high bytes of these 16-bit integers are deflated and encoded in base64. In this form,
 50 futures of a window take about 100 kB.
 """
@@ -253,13 +254,14 @@ def animate(
         observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing, as in the truth. With O = 0, people
             share no past, and time zero is their first pose.
         samples: (K, H, J, 3) in metres. Without samples, the observed motion is shown, without a past. Without a past,
-            joints may be NaN, and all are after the end of a shorter motion.
+            NaN marks missing joints, and all joints after the end of a shorter motion.
         truth: (F, J, 3) in metres, if known; F is at most H.
         names: names of the K samples; default: numbers.
         fixed: joints that move in the same way in all samples; bones that end in them are dark and thick.
         every: number of frames between shown frames, which include the last observed one; default: about 25 shown
             frames a second. The speed is not changed.
-        view: angle in radians between the last observed heading and the viewer at the start.
+        view: angle in radians between the last observed heading, or the first person's first one, and the viewer at the
+            start.
         title: title above the figure.
 
     Raises:

@@ -115,7 +115,8 @@ def futures(
         )
         ax = figure.subplots()
 
-    middle, digits = future[:, :, skeleton.root].mean(0), 1 if horizon >= frames * skeleton.fps / 10 else 2
+    middle = future[:, :, skeleton.root].mean(0)
+    digits = 1 if horizon >= frames * skeleton.fps / 10 else 2
 
     def draw(poses: np.ndarray, column: int, **line: Any) -> None:
         is_shared = len(crosses) and columns[column] > now
@@ -151,7 +152,7 @@ class Scene:
         skeleton: skeleton of all people.
         names: names of the P people; the truth, if any, is the first.
         colours: colour of each person after frame `now`.
-        motion: (P, O + H, J, 3) in metres, without the offsets of `places`; NaN after the end of a truth that ends
+        motion: (P, O + H, J, 3) in metres, without the offsets of `places`; NaN after the end of a motion that ends
             early.
         now: index of the last observed frame; -1 if people share no past.
         frames: indices of the frames to show, including `now`.
@@ -214,13 +215,13 @@ def make_scene(
         skeleton: skeleton of the poses.
         observed: (O, J, 3) in metres, numpy or torch; NaN where a joint is missing. With O = 0, people share no past,
             and time zero is their first pose.
-        samples: (K, H, J, 3) in metres; None to draw the observed motion without a past. Without a past, joints may be
-            NaN, and all are after the end of a shorter motion.
+        samples: (K, H, J, 3) in metres; None to draw the observed motion without a past. Without a past, NaN marks
+            missing joints, and all joints after the end of a shorter motion.
         truth: (F, J, 3) in metres with F at most H, NaN where a joint is missing; None if unknown.
         names: names of the K samples; numbers by default.
         fixed: indices of joints that move in the same way in all samples.
         every: number of frames between drawn frames; by default, about 25 frames per second are drawn.
-        view: angle in radians between the last observed heading and the viewer.
+        view: angle in radians between the last observed heading, or the first person's first one, and the viewer.
 
     Raises:
         ValueError: the shapes do not match each other or the skeleton, an array is empty, a position is not finite, or
@@ -284,7 +285,7 @@ def _to_viewer(
 ) -> np.ndarray:
     """Return motions (P, O + H, J, 3) of the observed past and P futures in the viewer's coordinates, with z up."""
     motion = np.full((len(futures), len(past) + horizon, skeleton.joints, 3), np.nan)
-    for k, ahead in enumerate(futures):  # a truth that ends early leaves NaN, which is not drawn
+    for k, ahead in enumerate(futures):  # a motion that ends early leaves NaN, which is not drawn
         motion[k, : len(past) + len(ahead)] = np.concatenate([past, ahead])
     start = motion[0, : max(len(past), 1)]
     turn = torch.tensor(view - final_heading(skeleton, torch.from_numpy(start)), dtype=torch.float64)

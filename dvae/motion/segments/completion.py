@@ -150,7 +150,7 @@ class SegmentCompletion:
                     _observe(name, value, observations[name], deviations.of(name) * counts**0.5)
                 else:  # all vertices of a frame weigh as much as its points
                     points = observations[POINTS].isfinite().all(-1).sum(-1).clip(min=1)[..., None, None]
-                    deviation = deviations.point * (value.shape[-2] / points).to(value).sqrt()
+                    deviation = deviations.point * (value.shape[-2] / points.to(value)).sqrt()
                     _observe(name, value, _near_points(value, observations), deviation)
         return {LATENT: z, SHAPE: shape}
 

@@ -252,6 +252,13 @@ def test_every_window_of_a_long_sequence_is_filled():
             filled = model.impute({"x": x, "mask": mask, **ragged}, 2)["x"]
             assert torch.equal(filled[:, mask], x[mask].expand(2, -1))
             assert (filled[:, 0].std(0)[~mask[0]] > 0).all()
+        whole = x.round().long()
+        for batch in ({"x": whole, "mask": mask}, {"x": whole.numpy(), "mask": mask.numpy()}):
+            filled = model.impute(batch, 2)["x"]
+            assert filled.dtype == torch.float32
+            assert (filled[:, ~mask] % 1 != 0).all()
+        with pytest.raises(ValueError, match="samples and chunk must be at least 1"):
+            model.impute({"x": x, "mask": mask}, 0)
     past, forecasts = torch.randn(2, 20, 2), []
     for start in (0, 17):  # a forecast reads as many steps as a training window has
         torch.manual_seed(0)
