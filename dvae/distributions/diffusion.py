@@ -493,9 +493,9 @@ class DenoisingDistribution(TorchDistribution):
 
     @torch.no_grad()
     def exact_log_prob(self, value: Tensor, steps: int = 50, probes: int | None = None) -> ODEDensity:
-        """Return the log density by the probability-flow ODE, which draws follow, except those of "ancestral".
+        """Return the log density by the probability-flow ODE. Guidance is ignored.
 
-        Draws of "ancestral" follow another distribution unless the denoiser is optimal. Guidance is ignored.
+        Draws follow this density, but those of "ancestral" only if the denoiser is optimal.
 
         Args:
             value: values (..., D).
@@ -572,9 +572,8 @@ def _extrapolation(levels: Tensor) -> Tensor:
     Args:
         levels: angles (steps + 1,), decreasing.
     """
-    drops = (
-        levels.sin().log() - levels.cos().abs().log()
-    ).diff()  # of the log noise level: infinite at 0, large at pi / 2
+    noise = levels.sin().log() - levels.cos().abs().log()  # infinite at 0, large at pi / 2
+    drops = noise.diff()
     shares = functional.pad(drops[1:] / (2 * drops[:-1]), (1, 0))
     return torch.where(shares.isfinite(), shares, 0.0)
 

@@ -888,7 +888,7 @@ def _check_sizes(sizes: Mapping[str, int]) -> dict[str, int]:
 
 
 def _density(conditional: Any) -> str:
-    """Return what a factor has for a density in training: "exact", a "bound" or a "loss"."""
+    """Return the kind of log density of a factor in training: "exact", "bound" or "loss"."""
     head = conditional.head
     return "loss" if head.trained_as_loss else str(head.density)
 

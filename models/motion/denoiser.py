@@ -66,7 +66,7 @@ class MotionDenoiser(FutureMethod):
         width: width of the transformer and of the code of h.
         heads_count, layers: attention heads and layers of the transformer.
         coefficients: number of sine coefficients that the transformer reads; 0 to denoise frames instead.
-        sampler: "heun", "ddim" or "ancestral".
+        sampler: "heun", "dpm", "ddim" or "ancestral", as in `Diffusion`.
         sampler_steps: number of steps of the sampler.
         drop: probability that training hides h, for guidance.
         guidance: weight of h in forecasts; above 1 needs `drop`, and forecasts no longer follow the density.
@@ -94,7 +94,7 @@ class MotionDenoiser(FutureMethod):
     heads_count: Size = 4
     layers: Layers = 3
     coefficients: Extra = 20
-    sampler: Literal["heun", "ddim", "ancestral"] = "heun"
+    sampler: Literal["heun", "dpm", "ddim", "ancestral"] = "heun"
     sampler_steps: Count = 6
     drop: Annotated[float, Range(0, 1, below=True)] = 0.0
     guidance: Amount = 1.0

@@ -49,8 +49,8 @@ def read_body(path: str | os.PathLike[str], shapes: int = 8) -> Body:
 
     Args:
         path: npz file of the model.
-        shapes: number of shape parameters S; the first S of the file are used. A file of SMPL-X has 300 if it has 400
-            columns, and otherwise 10; the others are expressions.
+        shapes: number of shape parameters S; the first S columns of `shapedirs` are used. In a file of SMPL-X, the
+            first 300 of 400 columns are shape parameters, or the first 10 of fewer; the others are expressions.
 
     Returns:
         Body with 22 joints and S shape parameters.

@@ -100,7 +100,9 @@ def test_bones_keep_their_observed_lengths(windows):
     torch.testing.assert_close(*directions)
 
 
-@pytest.mark.parametrize("options", [{}, {"coefficients": 0, "sampler": "ancestral"}, {"drop": 0.2, "guidance": 1.5}])
+@pytest.mark.parametrize(
+    "options", [{}, {"coefficients": 0, "sampler": "ancestral"}, {"drop": 0.2, "guidance": 1.5, "sampler": "dpm"}]
+)
 def test_forecasts_are_seeded_draws(windows, options):
     model, past, forecasts = built(windows, **options), past_of(batch_of(windows)), []
     for seed in (1, 1, 2):
